@@ -1,0 +1,1 @@
+"""The device's side: firmware, the world it measures, faults, and servers. Knows no driver and no estimator."""
