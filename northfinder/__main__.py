@@ -1,0 +1,5 @@
+"""``python -m northfinder`` is the command line."""
+
+from northfinder.cli import main
+
+main()

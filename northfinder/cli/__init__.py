@@ -1,0 +1,102 @@
+"""The command line: parse, compose, show, exit code. Only here (and in tests and tools) a driver meets an emulator.
+
+A command's module is imported only when that command runs, so that ``northfinder --help`` is quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import NoReturn
+
+import click
+
+#: Exit codes, documented in docs/operators-guide.md.
+EXIT_USAGE = 2
+EXIT_DEVICE = 3
+EXIT_ESTIMATE = 4
+EXIT_RECORD = 5
+EXIT_INTERRUPTED = 130
+
+_COMMANDS = {
+    "find": "Measure the true azimuth and the latitude.",
+    "solve": "Estimate again from a record, or from a table of measurements.",
+    "emulate": "Serve an emulated gyro and stage.",
+    "devices": "List the ports and identify what answers.",
+}
+
+
+class _LazyGroup(click.Group):
+    """Commands by name, imported when called for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # click's signature
+        """Return the commands in the order an operator meets them."""
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Import the command."""
+        if cmd_name not in _COMMANDS:
+            return None
+        module = importlib.import_module(f"northfinder.cli.{cmd_name}")
+        command: click.Command = module.command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(_COMMANDS.items()))
+
+
+@click.group(
+    cls=_LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Exit codes: 0 done, 2 usage or configuration, 3 device or link, 4 no trustworthy estimate, "
+    "5 record or file, 130 interrupted.",
+)
+@click.version_option(package_name="northfinder")
+def cli() -> None:
+    """Find true north and the latitude with a vibratory gyro on a rotation stage.
+
+    \b
+    Try it without any hardware:
+      northfinder find --speed max
+    """  # noqa: D301  # \b is click's mark to keep these lines as they are
+
+
+def main() -> NoReturn:
+    """Run the command line and leave with its exit code; every declared failure is one line."""
+    from drivers.errors import DeviceError  # noqa: PLC0415  # keeps --help quick
+    from northfinder.errors import NorthFinderError  # noqa: PLC0415
+    from northfinder.text import printable  # noqa: PLC0415
+
+    try:
+        code = cli.main(standalone_mode=False)
+    except click.exceptions.Abort:
+        code = EXIT_INTERRUPTED
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (DeviceError, NorthFinderError) as error:
+        print(f"northfinder: {printable(str(error), max_length=1000)}", file=sys.stderr)  # noqa: T201  # the one line
+        code = exit_code(error)
+    except BrokenPipeError:
+        # Whoever read our output has gone; nothing is left to say to them.
+        sys.stderr.close()
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def exit_code(error: Exception) -> int:
+    """Return the documented exit code of a declared failure."""
+    from drivers.errors import DeviceError  # noqa: PLC0415
+    from northfinder.errors import ConfigError, EstimateError, RecordError  # noqa: PLC0415
+    from northfinder.sequencer import StopRequestedError  # noqa: PLC0415
+
+    table: list[tuple[type[Exception], int]] = [
+        (ConfigError, EXIT_USAGE),
+        (DeviceError, EXIT_DEVICE),
+        (EstimateError, EXIT_ESTIMATE),
+        (RecordError, EXIT_RECORD),
+        (StopRequestedError, EXIT_INTERRUPTED),
+    ]
+    return next((code for kind, code in table if isinstance(error, kind)), 1)

@@ -1,0 +1,51 @@
+"""The configuration of a bench: one TOML file, strictly checked, and what stands in it as frozen structs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from northfinder.toml import read_toml
+
+
+class GyroTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """``[gyro]``: where the gyro is and which profile describes it."""
+
+    address: str
+    profile: str | None = None
+    baudrate: int = 921600
+
+
+class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """``[stage]``: where the stage is, and limits narrower than its own."""
+
+    address: str
+    baudrate: int = 921600
+    azimuth_min_deg: float | None = None
+    azimuth_max_deg: float | None = None
+    elevation_min_deg: float | None = None
+    elevation_max_deg: float | None = None
+    max_speed_deg_s: float | None = None
+
+
+class MeasurementTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """``[measurement]``: what to do with them."""
+
+    plan: str = "six-position"
+    dwell_s: float = 120.0
+    settle_s: float = 1.0
+    latitude_deg: float | None = None
+
+
+class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """A bench and a measurement on it."""
+
+    gyro: GyroTable
+    stage: StageTable
+    measurement: MeasurementTable = msgspec.field(default_factory=MeasurementTable)
+
+
+def read_config(path: Path) -> Config:
+    """Read a bench's configuration. Raises ConfigError naming the file, the key, what was found and expected."""
+    return read_toml(path, Config)

@@ -1,0 +1,388 @@
+"""The measurement as an explicit state machine: which state follows which event, and what each state does.
+
+    CONNECT -> IDENTIFY -> SELF_TEST -> HOME -> SLEW -> SETTLE -> DWELL -> SLEW -> ... -> FINISH -> DONE
+    any failure -> FAULT, where the stage is stopped; the operator's stop -> STOP, likewise
+
+Everything that arrives is handed to the recorder first. Dwells and settling are counted in the gyro's own samples and
+slews in the stage's own time, so the same sequence runs against hardware and at any speed against an emulator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Protocol
+
+from drivers.api import Clock, DeviceIdentity, Gyro, RateBlock, Stage, StageLimits, StageMode, StageState
+from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError
+from northfinder.cyclogram import Step, reachable_azimuth
+from northfinder.errors import NorthFinderError, SequenceError
+from northfinder.record import DwellSpan, Recorder
+
+
+class State(Enum):
+    """Where the measurement stands."""
+
+    CONNECT = "connect"
+    IDENTIFY = "identify"
+    SELF_TEST = "self-test"
+    HOME = "home"
+    SLEW = "slew"
+    SETTLE = "settle"
+    DWELL = "dwell"
+    FINISH = "finish"
+    STOP = "stop"
+    FAULT = "fault"
+    DONE = "done"
+    STOPPED = "stopped"
+    FAILED = "failed"
+
+
+class Event(Enum):
+    """What a state's action may end with."""
+
+    OK = "ok"
+    PLAN_COMPLETE = "plan complete"
+    STOP_REQUESTED = "stop requested"
+    FAILURE = "failure"
+
+
+def _working(following: State, **more: State) -> dict[Event, State]:
+    table = {Event.OK: following, Event.STOP_REQUESTED: State.STOP, Event.FAILURE: State.FAULT}
+    return table | {Event[name]: state for name, state in more.items()}
+
+
+TRANSITIONS: dict[State, dict[Event, State]] = {
+    State.CONNECT: _working(State.IDENTIFY),
+    State.IDENTIFY: _working(State.SELF_TEST),
+    State.SELF_TEST: _working(State.HOME),
+    State.HOME: _working(State.SLEW),
+    State.SLEW: _working(State.SETTLE, PLAN_COMPLETE=State.FINISH),
+    State.SETTLE: _working(State.DWELL),
+    State.DWELL: _working(State.SLEW),
+    State.FINISH: _working(State.DONE),
+    State.STOP: {Event.OK: State.STOPPED, Event.FAILURE: State.FAULT},
+    State.FAULT: {Event.OK: State.FAILED},
+}
+
+#: Host time within which a moving stage must have come to rest after a stop, in s.
+STOP_TIMEOUT = 5.0
+#: How often the devices are served at least while nothing arrives, in s; heartbeats hang on it.
+SERVICE_PERIOD = 0.05
+#: Stage time within which homing must end, in s.
+HOME_TIMEOUT = 180.0
+#: Stage time beyond twice its calculated duration within which a slew must end, in s.
+SLEW_MARGIN = 10.0
+
+
+class StopRequestedError(NorthFinderError):
+    """The operator asked to stop; the stage is at rest and the record holds all that was measured."""
+
+
+class Plan(Protocol):
+    """What to do next, perhaps in the light of what has been measured."""
+
+    @property
+    def name(self) -> str:
+        """The plan's name."""
+
+    def next_step(self, done: list[DwellSpan]) -> Step | None:
+        """Return the step that follows the finished dwells, None when the plan is complete."""
+
+    def remaining_dwell(self, done: list[DwellSpan]) -> float:
+        """Return how many seconds of dwell are still to come after `done`, as far as known now."""
+
+    def check(self, limits: StageLimits) -> None:
+        """Raise ConfigError if a stage with these limits cannot take all positions."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """What an observer may show. Times in s, rate in rad/s."""
+
+    state: State
+    n_done: int = 0
+    step: Step | None = None
+    step_fraction: float = 0.0  #: how much of the present dwell is done
+    remaining: float = 0.0  #: s of dwell still to come in the whole plan
+    rate: float | None = None  #: mean over the newest block, first axis
+    stage: StageState | None = None
+    n_samples: int = 0
+    n_lost: int = 0
+
+
+class Observer(Protocol):
+    """Whoever watches a measurement; must return quickly."""
+
+    def on_progress(self, progress: Progress) -> None:
+        """Take note of where the measurement stands; called for every batch of samples."""
+
+    def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> None:
+        """Take note of a finished dwell and of the blocks that hold its samples."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Sequencer:
+    """Runs one measurement: opens the devices, follows the plan, records everything, leaves all at rest."""
+
+    open_gyro: Callable[[], Gyro]
+    open_stage: Callable[[], Stage]
+    plan: Plan
+    recorder: Recorder
+    clock: Clock
+    observer: Observer
+    settle: float = 1.0  #: s of samples left out after each slew
+    stop_requested: Callable[[], bool] = lambda: False
+    gyro: Gyro | None = None
+    stage: Stage | None = None
+    identities: dict[str, DeviceIdentity] = field(default_factory=dict)
+    spans: list[DwellSpan] = field(default_factory=list)
+    _step: Step | None = None
+    _next_index: int = 0  #: one past the newest sample
+    _blocks: list[RateBlock] = field(default_factory=list)  #: of the present dwell
+    _state: StageState | None = None
+    _now: State = State.CONNECT
+    _failure: Exception | None = None
+
+    def run(self) -> list[DwellSpan]:
+        """Run the measurement and return its dwells.
+
+        Raises the DeviceError or NorthFinderError that ended it early, or StopRequestedError; the stage is then
+        stopped and everything measured is recorded.
+        """
+        actions = {
+            State.CONNECT: self._connect, State.IDENTIFY: self._identify, State.SELF_TEST: self._self_test,
+            State.HOME: self._home, State.SLEW: self._slew, State.SETTLE: self._settle, State.DWELL: self._dwell,
+            State.FINISH: self._finish, State.STOP: self._stop, State.FAULT: self._fault,
+        }  # fmt: skip
+        try:
+            while self._now in actions:
+                self.recorder.add_event("state", self._now.value)
+                self._report()
+                self._now = self._after(self._act(actions[self._now]))
+            self.recorder.add_event("state", self._now.value)
+        finally:
+            self._close()
+        if self._failure is not None:
+            raise self._failure
+        return self.spans
+
+    def _act(self, action: Callable[[], Event]) -> Event:
+        """Run a state's action; what ends it early becomes an event."""
+        try:
+            return action()
+        except StopRequestedError as stop:
+            self._failure = stop
+            return Event.STOP_REQUESTED
+        except (DeviceError, NorthFinderError) as failure:
+            self._failure = failure
+            return Event.FAILURE
+
+    def _after(self, event: Event) -> State:
+        try:
+            return TRANSITIONS[self._now][event]
+        except KeyError:
+            raise SequenceError(f"event {event.value!r} has no place in state {self._now.value!r}") from None
+
+    # What each state does
+
+    def _connect(self) -> Event:
+        self.gyro = self.open_gyro()
+        self.stage = self.open_stage()
+        return Event.OK
+
+    def _identify(self) -> Event:
+        gyro, stage = self._devices()
+        self.identities = {"gyro": gyro.connect(), "stage": stage.connect()}
+        self.recorder.set_meta("identities", self.identities)
+        self.recorder.set_meta("sample_rate", gyro.sample_rate)
+        self.plan.check(stage.limits)
+        return Event.OK
+
+    def _self_test(self) -> Event:
+        gyro, stage = self._devices()
+        for name, self_test in (("gyro", gyro.self_test), ("stage", stage.self_test)):
+            result = self_test()
+            self.recorder.add_event("self-test", f"{name}: {', '.join(result.failures) or 'passed'}")
+            if not result.passed:
+                raise DeviceFaultError(f"the {name} failed its self-test: {', '.join(result.failures)}")
+            self._check_stop()
+        return Event.OK
+
+    def _home(self) -> Event:
+        gyro, stage = self._devices()
+        state = self._service_stage()
+        if state.mode is not StageMode.IDLE:
+            stage.home()
+            deadline = state.device_time + HOME_TIMEOUT
+            self._serve(lambda: self._at_rest(deadline, "homing"), stream=False)
+        gyro.start()
+        return Event.OK
+
+    def _slew(self) -> Event:
+        stage = self._devices()[1]
+        self._step = self.plan.next_step(self.spans)
+        if self._step is None:
+            return Event.PLAN_COMPLETE
+        state = self._service_stage()
+        limits = stage.limits
+        azimuth = reachable_azimuth(self._step.azimuth, state.azimuth, limits.azimuth_min, limits.azimuth_max)
+        travel = max(abs(azimuth - state.azimuth), abs(self._step.elevation - state.elevation))
+        duration = travel / limits.max_speed + (
+            limits.max_speed / limits.max_acceleration if limits.max_acceleration else 0.0
+        )
+        stage.move(azimuth, self._step.elevation)
+        deadline = state.device_time + 2 * duration + SLEW_MARGIN
+        self._serve(lambda: self._at_rest(deadline, "the slew", in_position=True))
+        return Event.OK
+
+    def _settle(self) -> Event:
+        # The block being filled when the stage came to rest still holds samples of the slew: settling starts with
+        # the block after it.
+        self._serve_until_index(self._next_index + 1)
+        self._serve_until_index(self._next_index + round(self.settle * self._devices()[0].sample_rate))
+        return Event.OK
+
+    def _dwell(self) -> Event:
+        step = self._present_step()
+        first = self._next_index
+        stop = first + max(1, round(step.dwell * self._devices()[0].sample_rate))
+        self._blocks = []
+        states: list[StageState] = [self._service_stage()]
+
+        def done() -> bool:
+            if self._state is not None and self._state is not states[-1]:
+                states.append(self._state)
+            if states[-1].mode is not StageMode.IDLE:
+                raise DeviceFaultError(f"the stage left its position during a dwell: it is {states[-1].mode.value}")
+            return self._next_index >= stop
+
+        self._serve(done, first=first, stop=stop)
+        span = DwellSpan(
+            step=len(self.spans),
+            name=step.name,
+            azimuth=step.azimuth,
+            elevation=step.elevation,
+            dwell=step.dwell,
+            measured_azimuth=math.fsum(state.azimuth for state in states) / len(states),
+            measured_elevation=math.fsum(state.elevation for state in states) / len(states),
+            first_index=first,
+            stop_index=stop,
+        )
+        self.spans.append(span)
+        self.recorder.add_step(span)
+        self.observer.on_dwell(span, self._blocks)
+        return Event.OK
+
+    def _finish(self) -> Event:
+        self._devices()[0].stop()
+        return Event.OK
+
+    def _stop(self) -> Event:
+        """Bring the stage to rest on the operator's word."""
+        self._rest()
+        self.recorder.add_event("stopped", "on request")
+        return Event.OK
+
+    def _fault(self) -> Event:
+        """Bring the stage to rest as far as it still listens."""
+        self.recorder.add_event("failure", str(self._failure))
+        try:
+            self._rest()
+        except DeviceError as error:
+            self.recorder.add_event("failure", f"while stopping the stage: {error}")
+        return Event.OK
+
+    # What they share
+
+    def _devices(self) -> tuple[Gyro, Stage]:
+        if self.gyro is None or self.stage is None:
+            raise SequenceError(f"state {self._now.value!r} came before the devices were opened")
+        return self.gyro, self.stage
+
+    def _present_step(self) -> Step:
+        if self._step is None:
+            raise SequenceError(f"state {self._now.value!r} came before a step was chosen")
+        return self._step
+
+    def _rest(self) -> None:
+        if self.stage is None or self._state is None:
+            return  # never moved
+        self.stage.stop()
+        deadline = self.clock.now() + STOP_TIMEOUT
+        while self._service_stage().mode in {StageMode.MOVING, StageMode.HOMING, StageMode.STOPPING}:
+            if self.clock.now() >= deadline:
+                raise DeviceTimeoutError(f"the stage has not come to rest within {STOP_TIMEOUT:g} s of a stop")
+            self.clock.wait(min(deadline, self.clock.now() + SERVICE_PERIOD))
+
+    def _close(self) -> None:
+        for device in (self.stage, self.gyro):
+            if device is not None:
+                device.close()
+
+    def _check_stop(self) -> None:
+        if self.stop_requested():
+            raise StopRequestedError("stopped on request: the stage is at rest and the record is closed")
+
+    def _service_stage(self) -> StageState:
+        state = self._devices()[1].state()
+        if state is not self._state:
+            self._state = state
+            self.recorder.add_state(state)
+        return state
+
+    def _serve(self, done: Callable[[], bool], *, stream: bool = True, first: int | None = None, stop: int = 0) -> None:
+        """Serve both devices until `done`; keep the blocks of samples ``first`` to ``stop`` for the dwell."""
+        gyro = self._devices()[0]
+        while True:
+            self._check_stop()
+            state = self._service_stage()
+            if state.mode is StageMode.FAULT:
+                raise DeviceFaultError(f"the stage reports {state.fault}; it stays stopped until the fault is cleared")
+            blocks = gyro.read() if stream else []
+            for block in blocks:
+                self.recorder.add_block(block)
+                self._next_index = block.first_index + len(block.counts)
+                if first is not None and block.first_index < stop and self._next_index > first:
+                    self._blocks.append(block)
+            if blocks:
+                self._report(blocks[-1], first=first, stop=stop)
+            if done():
+                return
+            if not blocks:
+                self.clock.wait(self.clock.now() + SERVICE_PERIOD)
+
+    def _serve_until_index(self, index: int) -> None:
+        self._serve(lambda: self._next_index >= index)
+
+    def _at_rest(self, deadline: float, doing: str, *, in_position: bool = False) -> bool:
+        state = self._state
+        if state is None:
+            return False
+        if state.mode is StageMode.IDLE and (state.in_position or not in_position):
+            return True
+        if state.device_time > deadline:
+            raise DeviceTimeoutError(f"{doing} has not ended in time: the stage is {state.mode.value}")
+        return False
+
+    def _report(self, block: RateBlock | None = None, *, first: int | None = None, stop: int = 0) -> None:
+        fraction = 0.0 if first is None else min(1.0, (self._next_index - first) / (stop - first))
+        step = self._step
+        to_come = self.plan.remaining_dwell(self.spans)
+        if step is not None:
+            to_come -= fraction * step.dwell
+        self.observer.on_progress(
+            Progress(
+                state=self._now,
+                n_done=len(self.spans),
+                step=step,
+                step_fraction=fraction,
+                remaining=max(0.0, to_come),
+                rate=None if block is None else float(block.counts[:, 0].mean()) * block.rate_lsb,
+                stage=self._state,
+                n_samples=self.recorder.n_samples,
+                n_lost=self.recorder.n_lost,
+            )
+        )
