@@ -86,6 +86,10 @@ class StageBoard(Board):
         """Return on which side of the reference edge the axis stands: -1 below, +1 at or above it."""
         raise NotImplementedError
 
+    def overload(self, axis: int, now_us: int) -> bool:
+        """Return whether the drive of an axis reports that the motor cannot follow: tells a stall from a dead encoder."""
+        return False
+
     def limit_switch(self, axis: int, now_us: int) -> bool:
         """Return whether a limit switch of the axis is closed."""
         raise NotImplementedError
