@@ -29,7 +29,13 @@ class Clock(Protocol):
         """Return once `instant` has come."""
 
     def wait(self, deadline: float) -> None:
-        """Return at `deadline`, or earlier once a link on this clock has something to read or has failed."""
+        """Return at `deadline`, or earlier once something new has come on any link of this clock, or a link has failed.
+
+        Look at the links first, then wait: what has come since the last `wait` ends the next one at once.
+        """
+
+    def notify(self) -> None:
+        """End the present `wait`, or else the next one. For links, which may call it from any thread."""
 
 
 class ByteLink(Protocol):

@@ -1,0 +1,1 @@
+"""Moves bytes, to a deadline. Nothing of a third-party library's errors leaves this package."""

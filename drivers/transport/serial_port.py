@@ -1,0 +1,197 @@
+"""Serial ports, and TCP in the place of one, through pyserial.
+
+An address is a device path (``/dev/ttyUSB0``), a Windows port (``COM3``) or ``socket://host:port``.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import queue
+import select
+import socket
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+
+import serial
+from serial.tools import list_ports as _list_ports
+
+from drivers.api import ByteLink, Clock
+from drivers.errors import LinkError
+
+DEFAULT_BAUDRATE = 921_600
+_POLL = 0.05  # s, how often an idle reader looks whether it shall end
+_WRITE_TIMEOUT = 1.0  # s
+_CHUNK = 4096  # bytes a read at most
+_MAX_CHUNKS = 1024  # chunks that wait for the host; beyond it the operating system's buffer fills
+_SOCKET = "socket://"
+
+_OPEN_FAILURES = {
+    errno.ENOENT: "there is no such port; `northfinder devices` lists the ports",
+    errno.ENODEV: "there is no device behind it; is it plugged in?",
+    errno.EACCES: "no permission; on Linux the user must be in the port's group, often dialout",
+    errno.EPERM: "no permission; on Linux the user must be in the port's group, often dialout",
+    errno.EBUSY: "another program is using it",
+    errno.EAGAIN: "another program is using it",
+    errno.ENOTTY: "it is no serial port",
+    errno.ECONNREFUSED: "nothing listens there",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PortInfo:
+    """A serial port of this machine."""
+
+    address: str
+    description: str
+
+
+def list_ports() -> list[PortInfo]:
+    """Return the serial ports of this machine, by address."""
+    return [PortInfo(port.device, port.description or "") for port in sorted(_list_ports.comports())]
+
+
+def open_link(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -> ByteLink:
+    """Open a port for this program alone.
+
+    Parameters
+    ----------
+    address
+        Device path, Windows port name, or ``socket://host:port``.
+    clock
+        Its `wait` ends when something arrives.
+    baudrate
+        Bit/s; without meaning for a socket.
+
+    Raises
+    ------
+    LinkError
+        If the port does not exist, is in use, or may not be opened.
+    """
+    if "://" in address and not address.startswith(_SOCKET):
+        raise LinkError(f"cannot open {address}: of all URLs only socket://host:port is one of a device")
+    try:
+        port = serial.serial_for_url(
+            address,
+            baudrate,
+            timeout=0 if _selectable(address) else _POLL,
+            write_timeout=_WRITE_TIMEOUT,
+            exclusive=True if os.name == "posix" else None,
+        )
+    except (OSError, ValueError) as error:
+        raise LinkError(f"cannot open {address}: {_why(error)}") from error
+    _hasten(port, address)
+    return SerialLink(port, address, clock)
+
+
+class SerialLink:
+    """A `ByteLink` over an open pyserial port, read by a thread of its own."""
+
+    def __init__(self, port: serial.SerialBase, address: str, clock: Clock) -> None:
+        self._port = port
+        self._name = address
+        self._clock = clock
+        self._selectable = _selectable(address)
+        self._chunks: queue.Queue[bytes] = queue.Queue(_MAX_CHUNKS)
+        self._closed = False
+        self._lost = ""
+        self._reader = threading.Thread(target=self._read_on, name=f"reader of {address}", daemon=True)
+        self._reader.start()
+
+    @property
+    def name(self) -> str:
+        """The address it was opened with."""
+        return self._name
+
+    def write(self, data: bytes) -> None:
+        """Hand over all of `data` for sending; blocks while the port takes no more, for a second at most."""
+        self._require_open()
+        try:
+            self._port.write(data)
+        except serial.SerialTimeoutException as error:
+            raise LinkError(f"{self._name} takes no more bytes: nothing reads at its other end") from error
+        except (OSError, ValueError) as error:
+            self._lost = self._lost or f"{self._name} was unplugged ({error})"
+            self._require_open()
+
+    def receive(self) -> bytes:
+        """Return all bytes that have arrived, ``b""`` if none. Never waits."""
+        lost = self._lost  # seen before the queue, or a last chunk could be overlooked
+        chunks = []
+        with suppress(queue.Empty):
+            while True:
+                chunks.append(self._chunks.get_nowait())
+        if not chunks and (lost or self._closed):
+            self._require_open()
+        return b"".join(chunks)
+
+    def close(self) -> None:
+        """Release the port. Closing twice is no error."""
+        if self._closed:
+            return
+        self._closed = True
+        self._reader.join(1.0)
+        with suppress(OSError, ValueError):
+            self._port.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LinkError(f"{self._name} is closed")
+        if self._lost:
+            raise LinkError(self._lost)
+
+    def _read_on(self) -> None:
+        try:
+            while not self._closed:
+                if data := self._read_some():
+                    self._put(data)
+                    self._clock.notify()
+        except (OSError, ValueError) as error:
+            self._lost = f"{self._name} was unplugged ({error})"
+            self._clock.notify()
+
+    def _read_some(self) -> bytes:
+        """Return what has come, waiting a little for the first byte."""
+        if self._selectable:
+            ready, _, _ = select.select([self._port.fileno()], [], [], _POLL)
+            size = _CHUNK if ready else 0
+        else:
+            size = min(_CHUNK, max(1, self._port.in_waiting))
+        data: bytes = self._port.read(size) if size else b""
+        return data
+
+    def _put(self, data: bytes) -> None:
+        while not self._closed:
+            with suppress(queue.Full):
+                self._chunks.put(data, timeout=_POLL)
+                return
+
+
+def _selectable(address: str) -> bool:
+    """Return whether the port can be waited for with select, which takes all that has come in one read."""
+    return os.name == "posix" or address.startswith(_SOCKET)
+
+
+def _hasten(port: serial.SerialBase, address: str) -> None:
+    """Ask for short delays where the port has such a thing."""
+    with suppress(OSError, ValueError, AttributeError, NotImplementedError):
+        if address.startswith(_SOCKET):
+            with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as same:
+                same.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        else:
+            port.set_low_latency_mode(True)  # type: ignore[attr-defined]  # Linux alone has it
+
+
+def _why(error: BaseException) -> str:
+    """Return in plain words why a port cannot be opened."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, socket.gaierror):
+            return "its host name is not known"
+        if isinstance(cause, TimeoutError):
+            return "its host does not answer"
+        if isinstance(cause, OSError) and cause.errno in _OPEN_FAILURES:
+            return _OPEN_FAILURES[cause.errno]
+        cause = cause.__context__
+    return str(error)
