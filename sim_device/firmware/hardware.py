@@ -87,8 +87,8 @@ class StageBoard(Board):
         raise NotImplementedError
 
     def overload(self, axis: int, now_us: int) -> bool:
-        """Return whether the drive of an axis reports that the motor cannot follow: tells a stall from a dead encoder."""
-        return False
+        """Return whether the drive reports that its motor cannot follow: this tells a stall from a dead encoder."""
+        raise NotImplementedError
 
     def limit_switch(self, axis: int, now_us: int) -> bool:
         """Return whether a limit switch of the axis is closed."""
