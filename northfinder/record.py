@@ -14,7 +14,7 @@ closed, one plain file remains. Times are in s, angles in rad, rates in rad/s pe
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ import fastcrc
 import msgspec
 import numpy as np
 
-from drivers.api import Clock, GyroStatus, RateBlock, StageMode, StageState
+from drivers.api import GyroStatus, RateBlock, StageMode, StageState
 from northfinder.errors import RecordError
 
 #: "NFR1" in the file's header tells a record from any other SQLite file.
@@ -85,13 +85,13 @@ def _one_line(path: Path, doing: str) -> Iterator[None]:
 class Recorder:
     """Writes a new record. Use as a context manager; whatever ends the block, the record is closed."""
 
-    def __init__(self, path: Path, clock: Clock) -> None:
-        """Create the file `path`, which must not exist. Raises RecordError."""
+    def __init__(self, path: Path, now: Callable[[], float]) -> None:
+        """Create the file `path`, which must not exist; `now` tells the host's time in s. Raises RecordError."""
         self.path = path
-        self._clock = clock
+        self._now = now
         self._blocks: list[tuple[object, ...]] = []
         self._states: list[tuple[object, ...]] = []
-        self._next_write = clock.now() + WRITE_PERIOD
+        self._next_write = now() + WRITE_PERIOD
         self.n_samples = 0
         self.n_lost = 0
         try:
@@ -170,24 +170,22 @@ class Recorder:
         """Keep that something happened now."""
         self.write()
         with _one_line(self.path, "written"):
-            self._db.execute(
-                "INSERT INTO event (time, kind, detail) VALUES (?, ?, ?)", (self._clock.now(), kind, detail)
-            )
+            self._db.execute("INSERT INTO event (time, kind, detail) VALUES (?, ?, ?)", (self._now(), kind, detail))
 
     def add_fix(self, value: object) -> None:
         """Keep what was estimated."""
         self.write()
-        row = (self._clock.now(), msgspec.json.encode(value).decode())
+        row = (self._now(), msgspec.json.encode(value).decode())
         with _one_line(self.path, "written"):
             self._db.execute("INSERT INTO fix (time, value) VALUES (?, ?)", row)
 
     def _write_if_due(self) -> None:
-        if self._clock.now() >= self._next_write:
+        if self._now() >= self._next_write:
             self.write()
 
     def write(self) -> None:
         """Hand over to the file all that has arrived."""
-        self._next_write = self._clock.now() + WRITE_PERIOD
+        self._next_write = self._now() + WRITE_PERIOD
         blocks, self._blocks = self._blocks, []
         states, self._states = self._states, []
         if not (blocks or states):
