@@ -88,7 +88,7 @@ def open_link(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -
 class SerialLink:
     """A `ByteLink` over an open pyserial port, read by a thread of its own."""
 
-    def __init__(self, port: serial.SerialBase, address: str, clock: Clock) -> None:
+    def __init__(self, port: serial.Serial, address: str, clock: Clock) -> None:
         self._port = port
         self._name = address
         self._clock = clock
@@ -173,14 +173,14 @@ def _selectable(address: str) -> bool:
     return os.name == "posix" or address.startswith(_SOCKET)
 
 
-def _hasten(port: serial.SerialBase, address: str) -> None:
+def _hasten(port: serial.Serial, address: str) -> None:
     """Ask for short delays where the port has such a thing."""
     with suppress(OSError, ValueError, AttributeError, NotImplementedError):
         if address.startswith(_SOCKET):
             with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as same:
                 same.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         else:
-            port.set_low_latency_mode(True)  # type: ignore[attr-defined]  # Linux alone has it
+            port.set_low_latency_mode(True)  # Linux alone has it
 
 
 def _why(error: BaseException) -> str:

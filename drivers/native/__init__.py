@@ -1,0 +1,64 @@
+"""The native gyro and stage: the devices of ``docs/protocol.md``, over a serial port or TCP."""
+
+from __future__ import annotations
+
+from drivers.api import Clock, DeviceIdentity, Gyro, Stage, StageLimits
+from drivers.native.gyro import NativeGyro
+from drivers.native.session import Session
+from drivers.native.stage import NativeStage
+from drivers.transport.serial_port import DEFAULT_BAUDRATE, open_link
+
+__all__ = ["NativeGyro", "NativeStage", "identify", "open_gyro", "open_stage"]
+
+
+def open_gyro(
+    address: str,
+    clock: Clock,
+    *,
+    baudrate: int = DEFAULT_BAUDRATE,
+    sample_rate: float | None = None,
+    block_samples: int | None = None,
+) -> Gyro:
+    """Open the port of a native gyro; `connect` then speaks to it.
+
+    Raises
+    ------
+    LinkError
+        If the port cannot be opened.
+    """
+    link = open_link(address, clock, baudrate=baudrate)
+    return NativeGyro(link, clock, sample_rate=sample_rate, block_samples=block_samples)
+
+
+def open_stage(
+    address: str,
+    clock: Clock,
+    *,
+    baudrate: int = DEFAULT_BAUDRATE,
+    limits: StageLimits | None = None,
+) -> Stage:
+    """Open the port of a native stage; `connect` then speaks to it.
+
+    Raises
+    ------
+    LinkError
+        If the port cannot be opened.
+    """
+    return NativeStage(open_link(address, clock, baudrate=baudrate), clock, limits=limits)
+
+
+def identify(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -> DeviceIdentity:
+    """Ask who is behind a port, and release it. Sets nothing in motion; a moving stage comes to rest.
+
+    Raises
+    ------
+    LinkError
+        If the port cannot be opened.
+    DeviceTimeoutError, ProtocolError
+        If no native device of this version answers.
+    """
+    session = Session(open_link(address, clock, baudrate=baudrate), clock, kind=None)
+    try:
+        return session.open(attempts=3)
+    finally:
+        session.close()
