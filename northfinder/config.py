@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import msgspec
 
+from drivers.api import StageLimits
 from northfinder.toml import read_toml
 
 
@@ -22,11 +24,21 @@ class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
 
     address: str
     baudrate: int = 921600
-    azimuth_min_deg: float | None = None
-    azimuth_max_deg: float | None = None
-    elevation_min_deg: float | None = None
-    elevation_max_deg: float | None = None
-    max_speed_deg_s: float | None = None
+    azimuth_min_deg: float = -math.inf
+    azimuth_max_deg: float = math.inf
+    elevation_min_deg: float = -math.inf
+    elevation_max_deg: float = math.inf
+    max_speed_deg_s: float = math.inf
+
+    def limits(self) -> StageLimits:
+        """Return the limits in rad; infinite where the device's own are to hold."""
+        return StageLimits(
+            azimuth_min=math.radians(self.azimuth_min_deg),
+            azimuth_max=math.radians(self.azimuth_max_deg),
+            elevation_min=math.radians(self.elevation_min_deg),
+            elevation_max=math.radians(self.elevation_max_deg),
+            max_speed=math.radians(self.max_speed_deg_s),
+        )
 
 
 class MeasurementTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):

@@ -50,7 +50,7 @@ CREATE TABLE stage_state (
 CREATE TABLE step (
     id INTEGER PRIMARY KEY, name TEXT NOT NULL, azimuth REAL NOT NULL, elevation REAL NOT NULL, dwell REAL NOT NULL,
     measured_azimuth REAL NOT NULL, measured_elevation REAL NOT NULL,
-    first_index INTEGER NOT NULL, stop_index INTEGER NOT NULL);
+    first_index INTEGER NOT NULL, stop_index INTEGER NOT NULL, sample_rate REAL NOT NULL);
 CREATE TABLE event (id INTEGER PRIMARY KEY, time REAL NOT NULL, kind TEXT NOT NULL, detail TEXT NOT NULL);
 CREATE TABLE fix (id INTEGER PRIMARY KEY, time REAL NOT NULL, value TEXT NOT NULL);
 """
@@ -71,6 +71,7 @@ class DwellSpan:
     measured_elevation: float  #: rad
     first_index: int  #: of the dwell's first sample
     stop_index: int  #: one past its last
+    sample_rate: float  #: Hz
 
 
 @contextmanager
@@ -161,10 +162,10 @@ class Recorder:
         self.write()
         row = (
             span.step, span.name, span.azimuth, span.elevation, span.dwell, span.measured_azimuth,
-            span.measured_elevation, span.first_index, span.stop_index,
+            span.measured_elevation, span.first_index, span.stop_index, span.sample_rate,
         )  # fmt: skip
         with _one_line(self.path, "written"):
-            self._db.execute("INSERT INTO step VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            self._db.execute("INSERT INTO step VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
     def add_event(self, kind: str, detail: str = "") -> None:
         """Keep that something happened now."""

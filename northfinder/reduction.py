@@ -24,14 +24,13 @@ UNFIT = GyroStatus.NOT_READY | GyroStatus.SATURATED | GyroStatus.SENSOR_FAULT | 
 class Reduction:
     """The means of all dwells so far."""
 
-    sample_rate: float  #: Hz
     n_unfit: int = 0  #: samples in dwells that the gyro itself declared unfit
     n_missing: int = 0  #: samples in dwells that never came
     _parts: list[RateMeans] = field(default_factory=list)
 
     def add(self, span: DwellSpan, blocks: Iterable[RateBlock]) -> None:
         """Add a finished dwell from the blocks that hold its samples."""
-        samples_per_mean = max(1, round(MEAN_INTERVAL * self.sample_rate))
+        samples_per_mean = max(1, round(MEAN_INTERVAL * span.sample_rate))
         n_found = 0
         for run in _unbroken_runs(span, blocks):
             n_found += len(run.rate)
@@ -42,7 +41,7 @@ class Reduction:
                 from_samples(
                     run.rate,
                     run.first_index,
-                    self.sample_rate,
+                    span.sample_rate,
                     samples_per_mean=samples_per_mean,
                     azimuth=span.measured_azimuth,
                     elevation=span.measured_elevation,
@@ -107,7 +106,7 @@ def _mean_tilt(run: list[RateBlock]) -> tuple[float, float]:
 
 def reduce_record(record: Record) -> Reduction:
     """Reduce all finished dwells of a record. Raises RecordError."""
-    reduction = Reduction(float(record.meta("sample_rate") or 0.0))
+    reduction = Reduction()
     for span in record.steps():
         reduction.add(span, record.blocks(span.first_index, span.stop_index))
     return reduction

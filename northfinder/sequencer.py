@@ -270,6 +270,7 @@ class Sequencer:
             measured_elevation=math.fsum(state.elevation for state in states) / len(states),
             first_index=first,
             stop_index=stop,
+            sample_rate=self._devices()[0].sample_rate,
         )
         self.spans.append(span)
         self.recorder.add_step(span)
@@ -294,6 +295,11 @@ class Sequencer:
         except DeviceError as error:
             self.recorder.add_event("failure", f"while stopping the stage: {error}")
         return Event.OK
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample, in s."""
+        return self._next_index / self._devices()[0].sample_rate
 
     # What they share
 

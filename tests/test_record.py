@@ -37,7 +37,7 @@ STATE = StageState(
 )  # fmt: skip
 SPAN = DwellSpan(
     step=0, name="U1", azimuth=0.0, elevation=0.1, dwell=120.0, measured_azimuth=1e-6, measured_elevation=0.100001,
-    first_index=4, stop_index=12,
+    first_index=4, stop_index=12, sample_rate=235.0,
 )  # fmt: skip
 
 

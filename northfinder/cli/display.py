@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import Protocol
 
 from rich.console import Console
@@ -14,6 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from drivers.api import Clock
+from northfinder.estimation import Fix
 from northfinder.sequencer import Progress, State
 from northfinder.units import DPH
 
@@ -21,22 +21,10 @@ from northfinder.units import DPH
 REFRESH_PERIOD = 0.1
 
 
-@dataclass(frozen=True, slots=True)
-class RunningAzimuth:
-    """The azimuth as far as it is known now, in rad."""
-
-    azimuth: float
-    sd: float
-
-    def __str__(self) -> str:
-        """Return it as an operator reads it."""
-        return f"{math.degrees(self.azimuth):.3f} ± {math.degrees(self.sd):.3f} deg"
-
-
 class Display(Protocol):
     """Shows where a measurement stands."""
 
-    def show(self, progress: Progress, azimuth: RunningAzimuth | None) -> None:
+    def show(self, progress: Progress, fix: Fix | None) -> None:
         """Show it, unless it is too soon for another picture."""
 
 
@@ -50,15 +38,15 @@ class LiveDisplay:
         self._n_steps = n_steps
         self._next = -math.inf
 
-    def show(self, progress: Progress, azimuth: RunningAzimuth | None) -> None:
+    def show(self, progress: Progress, fix: Fix | None) -> None:
         """Draw the table."""
         now = self._clock.now()
         if now < self._next:
             return
         self._next = now + REFRESH_PERIOD
-        self._live.update(self._table(progress, azimuth), refresh=True)
+        self._live.update(self._table(progress, fix), refresh=True)
 
-    def _table(self, progress: Progress, azimuth: RunningAzimuth | None) -> Table:
+    def _table(self, progress: Progress, fix: Fix | None) -> Table:
         table = Table.grid(padding=(0, 2))
         step = progress.step
         name = "" if step is None else f"{step.name}, step {min(progress.n_done + 1, self._n_steps)} of {self._n_steps}"
@@ -75,7 +63,7 @@ class LiveDisplay:
                 f"elevation {math.degrees(progress.stage.elevation):.3f} deg",
             )
         table.add_row("samples", f"{progress.n_samples}, {progress.n_lost} lost")
-        table.add_row("azimuth", "not yet known" if azimuth is None else str(azimuth))
+        table.add_row("azimuth", "not yet known" if fix is None else azimuth_text(fix))
         return table
 
 
@@ -86,7 +74,7 @@ class PlainDisplay:
         """Start with nothing said."""
         self._last: tuple[State, int] | None = None
 
-    def show(self, progress: Progress, azimuth: RunningAzimuth | None) -> None:
+    def show(self, progress: Progress, fix: Fix | None) -> None:
         """Print a line if the state or the step has changed."""
         if (progress.state, progress.n_done) == self._last or progress.state in {State.SETTLE, State.SLEW}:
             return
@@ -94,14 +82,14 @@ class PlainDisplay:
         line = progress.state.value
         if progress.state is State.DWELL and progress.step is not None:
             line = f"dwell {progress.n_done + 1} at {progress.step.name}, {countdown(progress.remaining)} to go"
-            line += "" if azimuth is None else f", azimuth {azimuth}"
+            line += "" if fix is None else f", azimuth {azimuth_text(fix)}"
         print(line, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
 
 
 class SilentDisplay:
     """Shows nothing."""
 
-    def show(self, progress: Progress, azimuth: RunningAzimuth | None) -> None:
+    def show(self, progress: Progress, fix: Fix | None) -> None:
         """Show nothing."""
 
 
@@ -126,6 +114,11 @@ class DisplayContext(AbstractContextManager[Display]):
     def __exit__(self, *failure: object) -> None:
         """Take the display down."""
         self._context.__exit__(*failure)  # type: ignore[arg-type]  # handed through unread
+
+
+def azimuth_text(fix: Fix) -> str:
+    """Return the azimuth as an operator reads it."""
+    return f"{math.degrees(fix.azimuth):.3f} ± {math.degrees(fix.azimuth_sd):.3f} deg"
 
 
 def countdown(seconds: float) -> str:

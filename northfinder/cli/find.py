@@ -1,0 +1,165 @@
+"""``northfinder find``: the main job, from two devices to a fix and a record."""
+
+from __future__ import annotations
+
+import secrets
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from types import FrameType
+
+import click
+import msgspec
+
+from drivers.discovery import open_gyro, open_stage
+from drivers.transport.clock import SystemClock
+from northfinder.cli.display import DisplayContext
+from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
+from northfinder.cli.options import estimation_options
+from northfinder.cli.show import print_json, print_result
+from northfinder.config import Config, GyroTable, StageTable, read_config
+from northfinder.cyclogram import find_cyclogram
+from northfinder.errors import ConfigError
+from northfinder.measurement import Measurement, measure
+from northfinder.solution import Assumptions, Method
+
+
+@click.command("find")
+@click.option("--gyro", "gyro_address", metavar="DRIVER:ADDRESS", help="Such as native:/dev/ttyUSB0.")
+@click.option("--stage", "stage_address", metavar="DRIVER:ADDRESS", help="Such as native:/dev/ttyUSB1.")
+@click.option("--config", "config_file", type=click.Path(path_type=Path), metavar="FILE", help="A bench as TOML.")
+@click.option("--plan", metavar="NAME|FILE", help="six-position (default), four-position, or a TOML file.")
+@click.option("--dwell", "dwell_s", type=click.FloatRange(min=1), metavar="S", help="Dwell of a built-in plan.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("records"), show_default=True, metavar="DIR")
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+@click.option("--sim-azimuth", type=float, default=33.0, show_default=True, metavar="DEG", help="The emulator's truth.")
+@click.option("--sim-latitude", type=click.FloatRange(-90, 90), default=50.429, show_default=True, metavar="DEG")
+@click.option("--sim-profile", default="tvg43", show_default=True, metavar="NAME|FILE", help="The emulated gyro.")
+@click.option("--seed", type=click.IntRange(min=0), help="Of the emulated noise; random if not given.")
+@click.option("--speed", default="1", show_default=True, metavar="X|max", help="Emulator's speed over real time.")
+@estimation_options
+def command(
+    *,
+    gyro_address: str | None,
+    stage_address: str | None,
+    config_file: Path | None,
+    plan: str | None,
+    dwell_s: float | None,
+    out: Path,
+    quiet: bool,
+    sim_azimuth: float,
+    sim_latitude: float,
+    sim_profile: str,
+    seed: int | None,
+    speed: str,
+    latitude_deg: float | None,
+    profile: str | None,
+    g_drift_dph: float | None,
+    method: Method,
+    as_json: bool,
+) -> None:
+    """Measure the true azimuth of the input axis at stage azimuth zero, and the latitude.
+
+    Without devices an emulated bench is started for the run.
+
+    \b
+      northfinder find --speed max
+      northfinder find --gyro native:/dev/ttyUSB0 --stage native:/dev/ttyUSB1 --latitude 50.429
+      northfinder find --config bench.toml --json
+    """  # noqa: D301  # \b is click's mark to keep these lines as they are
+    started = time.monotonic()
+    clock = SystemClock()
+    config = _bench(gyro_address, stage_address, config_file)
+    truth = None
+    if config is None:
+        truth = SimulationOptions(
+            azimuth_deg=sim_azimuth,
+            latitude_deg=sim_latitude,
+            profile=sim_profile,
+            seed=secrets.randbits(32) if seed is None else seed,
+            speed=speed,
+        )
+        # The addresses follow once the emulator runs, which is only started for a command that is right otherwise.
+        config = Config(gyro=GyroTable(address="", profile=sim_profile), stage=StageTable(address=""))
+    wanted = config.measurement
+    cyclogram = find_cyclogram(plan or wanted.plan, dwell=dwell_s or wanted.dwell_s)
+    assumptions = Assumptions.gather(
+        profile=profile or config.gyro.profile,
+        latitude_deg=wanted.latitude_deg if latitude_deg is None else latitude_deg,
+        g_drift_dph=g_drift_dph,
+        method=method,
+    )
+    with ExitStack() as stack:
+        if truth is not None:
+            config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
+        stop_requested = stack.enter_context(_stop_on_signal(clock))
+        display = stack.enter_context(DisplayContext(clock, len(cyclogram.steps), quiet=quiet))
+        measurement = Measurement(
+            open_gyro=partial(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate),
+            open_stage=partial(
+                open_stage, config.stage.address, clock, baudrate=config.stage.baudrate, limits=config.stage.limits()
+            ),
+            plan=cyclogram,
+            settle=wanted.settle_s,
+            assumptions=assumptions,
+            record=_record_path(out),
+            meta={"northfinder": version("northfinder"), "config": config, "plan": cyclogram, "simulation": truth},
+        )
+        outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
+    result = outcome.to_json() | {"plan": cyclogram.name, "wall_s": round(time.monotonic() - started, 3)}
+    if as_json:
+        print_json(result)
+    else:
+        print_result(result, truth=None if truth is None else (truth.azimuth_deg, truth.latitude_deg))
+
+
+def _bench(gyro_address: str | None, stage_address: str | None, config_file: Path | None) -> Config | None:
+    """Return the bench the operator named, None if none was named."""
+    if config_file is not None:
+        if gyro_address or stage_address:
+            raise ConfigError("--config names the devices: leave --gyro and --stage out")
+        return read_config(config_file)
+    if gyro_address is None and stage_address is None:
+        return None
+    if gyro_address is None or stage_address is None:
+        raise ConfigError("--gyro and --stage go together: one of them is missing")
+    return Config(gyro=GyroTable(address=gyro_address), stage=StageTable(address=stage_address))
+
+
+def _emulated(config: Config, emulator: EmulatorProcess) -> Config:
+    """Return the configuration with the emulator's addresses."""
+    addresses = emulator.announcement()
+    return msgspec.structs.replace(
+        config,
+        gyro=msgspec.structs.replace(config.gyro, address=addresses["gyro"]),
+        stage=msgspec.structs.replace(config.stage, address=addresses["stage"]),
+    )
+
+
+def _record_path(folder: Path) -> Path:
+    """Return a new name in `folder`, by date and time."""
+    return folder / f"north-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}Z.sqlite"
+
+
+@contextmanager
+def _stop_on_signal(clock: SystemClock) -> Iterator[Callable[[], bool]]:
+    """Let the first Ctrl-C, termination or hang-up ask for a stop; yield the question whether one was asked for."""
+    requested = False
+
+    def request(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  # the signal module's signature
+        nonlocal requested
+        requested = True
+        clock.notify()
+
+    signals = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.signal(number, request) for number in signals}
+    try:
+        yield lambda: requested
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,45 @@
+"""Options that several commands share, and what is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+Command = Callable[..., Any]
+
+#: Values of --method.
+METHODS = ("generalised", "ordinary")
+
+
+def estimation_options(command: Command) -> Command:
+    """Add the options that say how to estimate and what is known beforehand."""
+    options = [
+        click.option(
+            "--latitude",
+            "latitude_deg",
+            type=click.FloatRange(-90, 90),
+            metavar="DEG",
+            help="Latitude, if known; else it is measured where the plan allows.",
+        ),
+        click.option("--profile", metavar="NAME|FILE", help="Gyro profile: noise and constants."),
+        click.option(
+            "--g-drift",
+            "g_drift_dph",
+            type=float,
+            metavar="DPH",
+            help="Acceleration-sensitive drift rate in deg/h per g, instead of the profile's.",
+        ),
+        click.option(
+            "--method",
+            type=click.Choice(METHODS),
+            default="generalised",
+            show_default=True,
+            help="Generalised or ordinary least squares, or the closed forms of the published method.",
+        ),
+        click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command

@@ -1,0 +1,47 @@
+"""Results on standard output: a panel for people, one JSON object for programs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.panel import Panel
+from rich.table import Table
+
+from northfinder.text import printable
+
+
+def print_json(value: object) -> None:
+    """Print `value` as one line of JSON."""
+    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
+    sys.stdout.flush()
+
+
+def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None = None) -> None:
+    """Print a fix as a panel; `truth` is the emulator's (azimuth, latitude) in deg."""
+    table = Table.grid(padding=(0, 2))
+    table.add_row("azimuth", f"[bold]{_with_sd(result['azimuth_deg'], result['azimuth_sd_deg'])}[/bold]")
+    if result["latitude_deg"] is None:
+        table.add_row("latitude", f"not measured: {result['latitude_reason']}")
+    else:
+        table.add_row("latitude", f"[bold]{_with_sd(result['latitude_deg'], result['latitude_sd_deg'])}[/bold]")
+    if truth is not None:
+        table.add_row("truth", f"azimuth {truth[0]:g} deg, latitude {truth[1]:g} deg, in the emulator")
+    table.add_row("bias", f"{result['bias_dph']:.3f} deg/h" if isinstance(result["bias_dph"], float) else "")
+    if result["scale_factor"] is not None:
+        table.add_row("scale factor", f"{result['scale_factor']:.4f} ± {result['scale_factor_sd']:.4f}")
+    for check in result["checks"]:
+        mark = "[green]pass[/green]" if check["passed"] else "[red]FAIL[/red]"
+        table.add_row(mark, printable(check["sentence"]))
+    if "n_samples" in result:
+        table.add_row("samples", f"{result['n_samples']} in {result['duration_s']:.1f} s, {result['n_lost']} lost")
+    if "record" in result:
+        table.add_row("record", printable(result["record"]))
+    Console().print(Panel(table, title="true north", expand=False))
+
+
+def _with_sd(value: float, sd: float) -> str:
+    return f"{value:.3f} ± {sd:.3f} deg"

@@ -1,0 +1,82 @@
+"""``northfinder solve``: a fix from a record or from a table of measurements."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from northfinder.cli.options import estimation_options
+from northfinder.cli.show import print_json, print_result
+from northfinder.errors import EstimateError
+from northfinder.solution import Assumptions, Method
+from northfinder.solve_file import solve_file
+from northfinder.text import printable
+
+
+@click.command("solve")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option(
+    "--input-axis-offset",
+    "offset_deg",
+    type=float,
+    default=0.0,
+    show_default=True,
+    metavar="DEG",
+    help="For a table of dwells: where the input axis points at stage azimuth zero.",
+)
+@estimation_options
+@click.pass_context
+def command(
+    context: click.Context,
+    *,
+    file: Path,
+    offset_deg: float,
+    latitude_deg: float | None,
+    profile: str | None,
+    g_drift_dph: float | None,
+    method: Method,
+    as_json: bool,
+) -> None:
+    """Estimate from FILE: a record of find, or CSV with a table of dwells or a static triad.
+
+    A record is solved under its own assumptions, and gives the fix of the live run again, unless options say otherwise.
+
+    \b
+      northfinder solve records/north-20260101T120000.000000Z.sqlite
+      northfinder solve dwells.csv --latitude 49 --input-axis-offset 180
+      northfinder solve triad.csv --json
+    """  # noqa: D301  # \b is click's mark to keep these lines as they are
+    given = {name: context.get_parameter_source(name) for name in ("latitude_deg", "profile", "g_drift_dph", "method")}
+    own = all(source is click.core.ParameterSource.DEFAULT for source in given.values())
+    assumptions = Assumptions.gather(profile=profile, latitude_deg=latitude_deg, g_drift_dph=g_drift_dph, method=method)
+    result = solve_file(file, None if own else assumptions, input_axis_offset=math.radians(offset_deg))
+    if as_json:
+        print_json(result)
+    elif "checks" in result:
+        print_result(result)
+    else:
+        Console().print(_table(result))
+    failed = [check["sentence"] for check in result.get("checks", []) if not check["passed"]]
+    if failed:
+        raise EstimateError(f"no trustworthy estimate: {failed[0]}")
+
+
+def _table(result: dict[str, Any]) -> Table:
+    """Return any plain result as rows of name and value."""
+    table = Table("", "", show_header=False)
+    for name, value in _flat(result):
+        table.add_row(printable(name), printable(value))
+    return table
+
+
+def _flat(value: Any, name: str = "") -> list[tuple[str, str]]:  # noqa: ANN401  # plain data of any shape
+    if isinstance(value, dict):
+        return [row for key, each in value.items() for row in _flat(each, f"{name}.{key}".lstrip("."))]
+    if isinstance(value, list):
+        return [row for number, each in enumerate(value) for row in _flat(each, f"{name}[{number}]")]
+    return [(name, f"{value:.4f}" if isinstance(value, float) else "" if value is None else str(value))]

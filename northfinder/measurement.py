@@ -1,0 +1,119 @@
+"""One whole measurement: sequence, record, reduction and estimate, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from drivers.api import Clock, Gyro, RateBlock, Stage
+from northfinder.errors import EstimateError
+from northfinder.estimation import Fix
+from northfinder.record import DwellSpan, Recorder
+from northfinder.reduction import Reduction
+from northfinder.sequencer import Plan, Progress, Sequencer
+from northfinder.solution import Assumptions, fix_to_json, solve
+
+
+class Watcher(Protocol):
+    """Shows a running measurement."""
+
+    def show(self, progress: Progress, fix: Fix | None) -> None:
+        """Show where it stands; `fix` is the estimate from the dwells finished so far, None while there is none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """What is to be measured, with what, and where to keep it."""
+
+    open_gyro: Callable[[], Gyro]
+    open_stage: Callable[[], Stage]
+    plan: Plan
+    settle: float  #: s
+    assumptions: Assumptions
+    record: Path
+    meta: Mapping[str, object] = field(default_factory=dict)  #: kept in the record as it is
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What a measurement has given."""
+
+    fix: Fix
+    record: Path
+    n_samples: int
+    n_lost: int
+    duration: float  #: s from the first to the last sample
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as plain data, in the units of the field."""
+        return fix_to_json(self.fix) | {
+            "n_samples": self.n_samples,
+            "n_lost": self.n_lost,
+            "duration_s": round(self.duration, 6),
+            "record": str(self.record),
+        }
+
+
+def measure(
+    measurement: Measurement,
+    *,
+    clock: Clock,
+    utc: Callable[[], float],
+    watcher: Watcher,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Outcome:
+    """Carry out a measurement; `utc` tells the date in s since 1970 for the record's events.
+
+    Raises what `Sequencer.run` raises, RecordError, and EstimateError if the data determine no azimuth. The record is
+    closed in every case.
+    """
+    with Recorder(measurement.record, utc) as recorder:
+        for key, value in measurement.meta.items():
+            recorder.set_meta(key, value)
+        recorder.set_meta("assumptions", measurement.assumptions)
+        observer = _Observer(watcher, measurement.assumptions)
+        sequencer = Sequencer(
+            open_gyro=measurement.open_gyro,
+            open_stage=measurement.open_stage,
+            plan=measurement.plan,
+            recorder=recorder,
+            clock=clock,
+            observer=observer,
+            settle=measurement.settle,
+            stop_requested=stop_requested,
+        )
+        sequencer.run()
+        fix = solve(observer.reduction.means(), measurement.assumptions)
+        outcome = Outcome(
+            fix=fix,
+            record=measurement.record,
+            n_samples=recorder.n_samples,
+            n_lost=recorder.n_lost,
+            duration=sequencer.duration,
+        )
+        recorder.add_fix(outcome.to_json())
+    return outcome
+
+
+@dataclass(slots=True)
+class _Observer:
+    """Reduces each dwell as it ends, and keeps the running fix."""
+
+    watcher: Watcher
+    assumptions: Assumptions
+    reduction: Reduction = field(default_factory=Reduction)
+    fix: Fix | None = None
+
+    def on_progress(self, progress: Progress) -> None:
+        """Show it."""
+        self.watcher.show(progress, self.fix)
+
+    def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> None:
+        """Reduce the dwell, and estimate as soon as that is possible."""
+        self.reduction.add(span, blocks)
+        try:
+            self.fix = solve(self.reduction.means(), self.assumptions)
+        except EstimateError:
+            self.fix = None  # too early to tell

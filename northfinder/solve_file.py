@@ -1,0 +1,82 @@
+"""A fix from a file: a record of ours, a table of dwells, or a static triad."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import msgspec
+
+from northfinder.errors import RecordError
+from northfinder.estimation.double_gyrocompass import solve_triad
+from northfinder.estimation.dwell_table import solve_dwell_table
+from northfinder.estimation.triad import static_mean
+from northfinder.record import Record
+from northfinder.reduction import reduce_record
+from northfinder.solution import Assumptions, fix_to_json, solve
+from northfinder.table_report import dwell_table_json, triad_json
+from northfinder.tables import DwellTable, StaticTriad, read_table
+
+_SQLITE = b"SQLite format 3\0"
+
+
+def solve_file(path: Path, assumptions: Assumptions | None, *, input_axis_offset: float = 0.0) -> dict[str, object]:
+    """Return the fix from a file of any kind.
+
+    Parameters
+    ----------
+    path : Path
+        Told apart by its content, not by its name.
+    assumptions : Assumptions, optional
+        In place of those kept in a record; for a table, its latitude is used.
+    input_axis_offset : float
+        For a table of dwells: where the input axis points at stage azimuth zero, rad.
+
+    Raises
+    ------
+    RecordError
+        The file is of no kind known, or damaged.
+    EstimateError
+        Its data determine no azimuth.
+    """
+    try:
+        with path.open("rb") as file:
+            is_record = file.read(len(_SQLITE)) == _SQLITE
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+    if is_record:
+        return solve_record(path, assumptions)
+    latitude_deg = None if assumptions is None else assumptions.latitude_deg
+    latitude = None if latitude_deg is None else math.radians(latitude_deg)
+    return _solve_table(read_table(path), latitude, input_axis_offset)
+
+
+def solve_record(path: Path, assumptions: Assumptions | None = None) -> dict[str, object]:
+    """Return the fix from a record, under its own assumptions unless others are given."""
+    with Record(path) as record:
+        if assumptions is None:
+            assumptions = _kept_assumptions(record)
+        reduction = reduce_record(record)
+        fix = solve(reduction.means(), assumptions)
+        plan = record.meta("plan") or {}
+    return fix_to_json(fix) | {"plan": plan.get("name"), "record": str(path)}
+
+
+def _kept_assumptions(record: Record) -> Assumptions:
+    try:
+        return msgspec.convert(record.meta("assumptions"), Assumptions)
+    except msgspec.ValidationError as error:
+        raise RecordError(f"the record {record.path} is damaged: its assumptions cannot be read: {error}") from None
+
+
+def _solve_table(
+    table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float
+) -> dict[str, object]:
+    if isinstance(table, StaticTriad):
+        means = [static_mean(position.name, position.rate, position.specific_force) for position in table.positions]
+        return triad_json(solve_triad(means, latitude=latitude))
+    return dwell_table_json(
+        solve_dwell_table(
+            table.azimuth, table.elevation, table.rate, input_axis_offset=input_axis_offset, latitude=latitude
+        )
+    )
