@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import queue
+import re
 import select
 import socket
 import threading
@@ -26,6 +27,7 @@ _WRITE_TIMEOUT = 1.0  # s
 _CHUNK = 4096  # bytes a read at most
 _MAX_CHUNKS = 1024  # chunks that wait for the host; beyond it the operating system's buffer fills
 _SOCKET = "socket://"
+_SOCKET_ADDRESS = re.compile(r"socket://([\w.-]+|\[[\da-fA-F:.]+\]):(\d{1,5})", re.ASCII)
 
 _OPEN_FAILURES = {
     errno.ENOENT: "there is no such port; `northfinder devices` lists the ports",
@@ -69,8 +71,9 @@ def open_link(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -
     LinkError
         If the port does not exist, is in use, or may not be opened.
     """
-    if "://" in address and not address.startswith(_SOCKET):
-        raise LinkError(f"cannot open {address}: of all URLs only socket://host:port is one of a device")
+    url = _SOCKET_ADDRESS.fullmatch(address)
+    if "://" in address and not (url and int(url[2]) < 2**16):
+        raise LinkError(f"cannot open {address}: of all URLs only socket://HOST:PORT is that of a device")
     try:
         port = serial.serial_for_url(
             address,
@@ -191,7 +194,7 @@ def _why(error: BaseException) -> str:
             return "its host name is not known"
         if isinstance(cause, TimeoutError):
             return "its host does not answer"
-        if isinstance(cause, OSError) and cause.errno in _OPEN_FAILURES:
-            return _OPEN_FAILURES[cause.errno]
+        if cause.args and cause.args[0] in _OPEN_FAILURES:
+            return _OPEN_FAILURES[cause.args[0]]
         cause = cause.__context__
     return str(error)
