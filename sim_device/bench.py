@@ -1,0 +1,208 @@
+"""A whole bench in virtual time: plant, boards and firmware of both devices, on one clock.
+
+A `Line` is the host's end of one device's line, a function of time like the firmware itself: ``feed(data, now_us)``,
+``poll(now_us)``, ``next_due_us()``, all in world time. Whichever line is asked, the whole world is first brought to
+that instant in the order of what is due, so that the gyro always samples where the stage was.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from sim_device.firmware.gyro import GyroDevice
+from sim_device.firmware.stage import StageDevice
+from sim_device.plant.boards import SimGyroBoard, SimStageBoard
+from sim_device.plant.earth import Site
+from sim_device.plant.gyro import STREAM_STAGE, STREAM_TILT, Gyro, seed_of
+from sim_device.plant.noise import NoiseSource
+from sim_device.plant.profile import Profile, load_profile
+from sim_device.plant.stage import Stage
+
+NOISE_BATCH = 8192  #: samples made at a time
+FIRST_BOOT = 1
+
+
+class Device(Protocol):
+    """What the firmware of either device offers, in the board's time."""
+
+    @property
+    def seen_time_us(self) -> int:
+        """Newest device time that the host says it has read."""
+
+    @property
+    def session(self) -> int:
+        """Number of the open session, 0 if none."""
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Take what came over the line."""
+
+    def poll(self, now_us: int) -> bytes:
+        """Do what is due and return what to send."""
+
+    def next_due_us(self) -> int | None:
+        """Return when there will be something to do."""
+
+
+class Line:
+    """The host's end of one device's line."""
+
+    def __init__(self, bench: SimBench, name: str, device: Device) -> None:
+        self.bench = bench
+        self.name = name  #: "gyro" or "stage"
+        self.device = device
+        self.epoch_us = 0  #: world time of the device's start
+        self.room: int | None = None  #: bytes that the line can take now, None for any number; beyond, blocks are lost
+        self._out = bytearray()
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Hand `data` to the device at `now_us`."""
+        self.bench.advance_to(now_us)
+        self.device.feed(data, self.bench.now_us - self.epoch_us)
+        self.serve()
+
+    def poll(self, now_us: int) -> bytes:
+        """Return what the device has sent up to `now_us`."""
+        self.bench.advance_to(now_us)
+        out = bytes(self._out)
+        self._out.clear()
+        return out
+
+    def next_due_us(self) -> int | None:
+        """Return when the device will next do something, or now if it has sent already."""
+        return self.bench.now_us if self._out else self.due_us()
+
+    def due_us(self) -> int | None:
+        """Return when the device will next do something, in world time."""
+        due = self.device.next_due_us()
+        return None if due is None else due + self.epoch_us
+
+    def serve(self) -> None:
+        """Let the device do what is due now."""
+        now_us = self.bench.now_us - self.epoch_us
+        if self.room is not None and isinstance(self.device, GyroDevice):
+            self._out += self.device.poll(now_us, self.room)
+        else:
+            self._out += self.device.poll(now_us)
+
+    def restart(self, device: Device) -> None:
+        """Go on with a device that has just started; what the old one had not yet sent is lost."""
+        self.device = device
+        self.epoch_us = self.bench.now_us
+        self._out.clear()
+
+
+class SimBench:
+    """An emulated gyro on an emulated stage.
+
+    Parameters
+    ----------
+    profile
+        Its name, the path of its file, or itself.
+    seed
+        Of all that is random.
+    azimuth
+        True azimuth of stage azimuth zero, rad.
+    latitude
+        Rad.
+    tilt
+        Of the rotation axis, rad, see the convention sheet in ``northfinder``.
+    noise
+        Of each gyro axis, instead of the profile's.
+
+    """
+
+    def __init__(
+        self,
+        profile: str | Profile = "tvg43",
+        *,
+        seed: int = 0,
+        azimuth: float = 0.0,
+        latitude: float = 0.0,
+        tilt: tuple[float, float] = (0.0, 0.0),
+        noise: list[NoiseSource] | None = None,
+    ) -> None:
+        self.profile = profile if isinstance(profile, Profile) else load_profile(profile)
+        self.seed = seed
+        self.now_us = 0
+        self.site = Site(latitude=latitude, heading=azimuth, tilt=tilt)
+        self.plant_stage = Stage(self.profile.stage, seed_of(seed, STREAM_STAGE))
+        self._noise = noise
+        self._order = itertools.count()
+        self._scheduled: list[tuple[int, int, Callable[[], None]]] = []
+        self.stage_board = self._make_stage_board(FIRST_BOOT)
+        self.gyro_board = self._make_gyro_board(FIRST_BOOT)
+        self.stage = Line(self, "stage", StageDevice(self.stage_board))
+        self.gyro = Line(self, "gyro", GyroDevice(self.gyro_board))
+        self.lines = (self.stage, self.gyro)  # the stage first: the gyro samples where it then stands
+
+    def advance_to(self, now_us: int) -> None:
+        """Let everything happen that is due up to `now_us`, in its order. An instant already past changes nothing."""
+        while (event := self._next_event()) is not None and event[0] <= now_us:
+            self.now_us = max(self.now_us, event[0])
+            line = event[1]
+            if line is None:
+                heapq.heappop(self._scheduled)[2]()
+                continue
+            line.serve()
+            if line.due_us() == event[0]:
+                raise RuntimeError(f"the {line.name} has been served at {event[0]} us and is due at that instant again")
+        self.now_us = max(self.now_us, now_us)
+
+    def next_due_us(self) -> int | None:
+        """Return when something will next happen, None if nothing is due."""
+        event = self._next_event()
+        return None if event is None else event[0]
+
+    def at(self, instant_us: int, action: Callable[[], None]) -> None:
+        """Let `action` happen at an instant of the world, such as a fault of the plant."""
+        heapq.heappush(self._scheduled, (instant_us, next(self._order), action))
+
+    def reset(self, name: str) -> None:
+        """Switch the device of that name ("gyro" or "stage") off and on, now."""
+        if name == "gyro":
+            self.gyro_board = self._make_gyro_board(self.gyro_board.boot_count + 1)
+            self.gyro.restart(GyroDevice(self.gyro_board))
+        elif name == "stage":
+            self.stage_board = self._make_stage_board(self.stage_board.boot_count + 1)
+            self.stage.restart(StageDevice(self.stage_board))
+        else:
+            raise ValueError(f"no device {name!r}: gyro or stage")
+
+    def _next_event(self) -> tuple[int, Line | None] | None:
+        found: tuple[int, Line | None] | None = (self._scheduled[0][0], None) if self._scheduled else None
+        for line in self.lines:
+            due = line.due_us()
+            if due is not None and (found is None or due < found[0]):
+                found = due, line
+        return found
+
+    def _make_gyro_board(self, boot_count: int) -> SimGyroBoard:
+        gyro = Gyro(
+            self.profile.gyro,
+            self.site,
+            seed=self.seed,
+            start=boot_count,
+            noise=self._noise,
+            batch=NOISE_BATCH,
+        )
+        return SimGyroBoard(
+            gyro,
+            self.plant_stage,
+            serial_number=f"SIM-G{self.seed % 10**10}",
+            tilt_rng=np.random.default_rng(seed_of(self.seed, STREAM_TILT, boot_count)),
+            epoch_us=self.now_us,
+            boot_count=boot_count,
+        )
+
+    def _make_stage_board(self, boot_count: int) -> SimStageBoard:
+        return SimStageBoard(
+            self.plant_stage,
+            serial_number=f"SIM-S{self.seed % 10**10}",
+            epoch_us=self.now_us,
+            boot_count=boot_count,
+        )
