@@ -1,0 +1,134 @@
+"""Measure how fast and how large the instrument is: ``python tools/bench.py [--json] [NAME...]``.
+
+find     wall time and memory of a whole ``find --speed max``, both processes' start included
+decode   bytes of the wire to arrays
+live     processor time of transport, driver and record at 2,000 samples/s of three axes
+help     wall time of ``northfinder --help``
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from drivers.native import open_gyro
+from drivers.protocol.framing import FrameDecoder
+from drivers.transport.clock import SystemClock
+from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
+from northfinder.record import Recorder
+
+#: What the project promises; the figures are printed beside them.
+LIMITS = {
+    "find_wall_s": 4.0,
+    "find_memory_mb": 150.0,
+    "decode_samples_per_s": 1e6,
+    "live_cpu_percent": 5.0,
+    "help_wall_s": 0.5,
+}
+LIVE_SECONDS = 20.0
+
+
+def run_timed(arguments: list[str]) -> tuple[float, float]:
+    """Run ``northfinder`` and return its wall time in s and its greatest resident memory in MB."""
+    started = time.perf_counter()
+    child = subprocess.Popen([sys.executable, "-m", "northfinder", *arguments], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"northfinder {' '.join(arguments)} ended with exit code {child.returncode}")
+    return time.perf_counter() - started, usage.ru_maxrss / 1024
+
+
+def bench_find() -> dict[str, float]:
+    """Time five whole measurements of 16 min of data."""
+    with tempfile.TemporaryDirectory() as folder:
+        runs = [
+            run_timed(["find", "--json", "--quiet", "--speed", "max", "--seed", str(seed), "--out", folder])
+            for seed in range(5)
+        ]
+    return {
+        "find_wall_s": statistics.median(wall for wall, _ in runs),
+        "find_memory_mb": max(memory for _, memory in runs),
+    }
+
+
+def bench_decode() -> dict[str, float]:
+    """Time the way from bytes to arrays of rates on frames of 47 samples."""
+    from drivers.protocol.native import decode_samples  # noqa: PLC0415  # beside its only use
+    from sim_device.bench import SimBench  # noqa: PLC0415
+
+    wire = sampled_wire(SimBench("tvg43", seed=1))
+    n_samples, best = 0, np.inf
+    for _ in range(5):
+        started = time.perf_counter()
+        decoder = FrameDecoder()
+        batches = [decode_samples(decoder.feed(wire[i : i + 4096])) for i in range(0, len(wire), 4096)]
+        best = min(best, time.perf_counter() - started)
+        n_samples = sum(samples.size for batch in batches for samples in batch)
+    return {"decode_samples_per_s": n_samples / best}
+
+
+def bench_live() -> dict[str, float]:
+    """Measure this process while it reads and records a fast gyro in real time."""
+    clock = SystemClock()
+    options = SimulationOptions(azimuth_deg=33.0, latitude_deg=50.0, profile="fast3", seed=1, speed="1")
+    with EmulatorProcess(options) as emulator, tempfile.TemporaryDirectory() as folder:
+        address = emulator.announcement()["gyro"].removeprefix("native:")
+        with Recorder(Path(folder) / "live.sqlite", time.time) as recorder:
+            gyro = open_gyro(address, clock)
+            gyro.connect()
+            gyro.start()
+            started, cpu = clock.now(), time.process_time()
+            while clock.now() < started + LIVE_SECONDS:
+                for block in gyro.read():
+                    recorder.add_block(block)
+                clock.wait(clock.now() + 0.05)
+            cpu, wall = time.process_time() - cpu, clock.now() - started
+            gyro.close()
+            rate, lost = recorder.n_samples / wall, recorder.n_lost
+    return {"live_cpu_percent": 100 * cpu / wall, "live_samples_per_s": rate, "live_samples_lost": lost}
+
+
+def bench_help() -> dict[str, float]:
+    """Time the help page."""
+    return {"help_wall_s": statistics.median(run_timed(["--help"])[0] for _ in range(5))}
+
+
+BENCHES: dict[str, Callable[[], dict[str, float]]] = {
+    "find": bench_find,
+    "decode": bench_decode,
+    "live": bench_live,
+    "help": bench_help,
+}
+
+
+def main() -> None:
+    """Run the benches named, or all, and print their figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", choices=[[], *BENCHES], default=[], metavar="NAME")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    arguments = parser.parse_args()
+    figures: dict[str, float] = {}
+    for name in arguments.names or BENCHES:
+        print(f"{name} ...", file=sys.stderr)
+        figures |= BENCHES[name]()
+    if arguments.json:
+        print(json.dumps(figures))
+        return
+    for name, value in figures.items():
+        limit = f"   (promised: {LIMITS[name]:,g})" if name in LIMITS else ""
+        print(f"{name:24} {value:14,.3f}{limit}")
+
+
+if __name__ == "__main__":
+    main()
