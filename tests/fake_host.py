@@ -100,6 +100,14 @@ def status(body: bytes) -> Status:
 class Device(Protocol):
     """Either device."""
 
+    @property
+    def session(self) -> int:
+        """The open session."""
+
+    @property
+    def n_dropped(self) -> int:
+        """Frames dropped."""
+
     def feed(self, data: bytes, now_us: int) -> None:
         """Take bytes."""
 

@@ -102,7 +102,11 @@ class Axis:
     @property
     def rate(self) -> int:
         """Measured speed, counts a second."""
-        (first_us, first), (last_us, last) = self._trail[0], self._trail[-1]
+        return self._rate_since(0)
+
+    def _rate_since(self, entry: int) -> int:
+        """Return the speed measured since an entry of the trail."""
+        (first_us, first), (last_us, last) = self._trail[entry], self._trail[-1]
         return (last - first) * 1_000_000 // (last_us - first_us) if last_us > first_us else 0
 
     @property
@@ -144,7 +148,8 @@ class Axis:
         if abs(self._command - self._command_at_change) > IN_POSITION:
             return ENCODER
         direction = self.profile.direction
-        forward = direction * self.rate if direction else -abs(self.rate)
+        rate = self._rate_since(max(-3, -len(self._trail)))
+        forward = direction * rate if direction else -abs(rate)
         return RUNAWAY if direction * self.lag > 0 or forward < -_WRONG_WAY else STALL
 
     def rest(self) -> None:
