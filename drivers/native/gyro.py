@@ -15,7 +15,7 @@ from drivers.protocol.native import (
     ANGLE_LSB,
     RATE_LSB,
     TEMPERATURE_LSB,
-    TIME_LSB,
+    US_PER_S,
     DeviceKind,
     MessageType,
     decode_samples,
@@ -189,7 +189,7 @@ class NativeGyro:
             blocks.append(
                 RateBlock(
                     first_index=self._next_index - len(rates),
-                    device_time=time_us * TIME_LSB,
+                    device_time=time_us / US_PER_S,
                     arrival_time=now,
                     counts=rates,
                     rate_lsb=RATE_LSB,

@@ -31,7 +31,7 @@ REPEAT_INTERVAL = 0.2  # s between repetitions of a request
 ATTEMPTS = 5
 HEARTBEAT_PERIOD = 0.05  # s of host time; half of what the protocol asks, so that a late call does no harm
 HEARTBEAT_SPAN_US = 100_000  # of device time
-_MAX_STREAM = 4096  # stream frames that wait for the driver; the index shows it if more came
+MAX_STREAM = 4096  # stream frames that wait for the driver; the index shows it if more came
 
 
 def _span(kind: MessageType, name: str) -> slice:
@@ -94,7 +94,7 @@ class Session:
         self._open = False
         self._request_id = 0
         self._replies: deque[Container] = deque(maxlen=_MAX_REPLIES)
-        self._stream: deque[bytes] = deque(maxlen=_MAX_STREAM)
+        self._stream: deque[bytes] = deque(maxlen=MAX_STREAM)
         self._stream_at = 0.0
         self._seen_us = 0
         self._beaten_us = 0

@@ -15,7 +15,7 @@ from drivers.native.session import HEARTBEAT_PERIOD, LinkCounts, Session, random
 from drivers.protocol.native import (
     ANGLE_LSB,
     IN_POSITION,
-    TIME_LSB,
+    US_PER_S,
     DeviceKind,
     MessageType,
     StageCode,
@@ -226,7 +226,7 @@ class NativeStage:
         if report.move_id < self._move_id and mode is not StageMode.FAULT:
             mode = self._begun
         return StageState(
-            device_time=report.device_time_us * TIME_LSB,
+            device_time=report.device_time_us / US_PER_S,
             arrival_time=self._clock.now(),
             mode=mode,
             azimuth=report.azimuth * ANGLE_LSB,

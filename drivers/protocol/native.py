@@ -61,7 +61,7 @@ DEFINITION_HASH = 0x66B325A6  #: CRC-32C of the definition in ``docs/protocol.md
 RATE_LSB = radians(2**-10 / 3600)  #: rad/s
 ANGLE_LSB = radians(0.1 / 3600)  #: rad; also rad/s, rad/s^2
 TEMPERATURE_LSB = 1 / 256  #: degrees Celsius
-TIME_LSB = 1e-6  #: s
+US_PER_S = 1e6  #: device time is divided by it, which rounds better than a product
 
 
 class MessageType(IntEnum):
