@@ -1,0 +1,134 @@
+"""Named checks of an estimate: a value that ought to be small, its standard deviation, and the limit it must keep.
+
+Each limit is passed by chance once in a thousand good measurements.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from northfinder.estimation.geometry import sensitivity
+from northfinder.estimation.means import RateMeans
+
+Array = NDArray[np.float64]
+
+FALSE_ALARM = 1e-3
+#: The horizontal earth rate must exceed this many of its standard deviations; at the limit the azimuth's is 19 deg.
+HORIZONTAL_LIMIT = 3.0
+#: Input axes closer than this, rad, stand in the same position.
+SAME_POSITION = math.radians(1.0)
+_DPH = math.degrees(1.0) * 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One check: whether `value` keeps within `limit`."""
+
+    name: str
+    value: float  #: in `unit`
+    sd: float  #: standard deviation of the value, same unit
+    limit: float  #: same unit
+    unit: str  #: "rad/s", "rad" or "1"
+    passed: bool
+    sentence: str  #: what it means, for the operator
+
+
+def horizontal_rate(nev: Array, covariance: Array) -> Check:
+    """Return whether the horizontal earth rate stands out of its noise: without it there is no azimuth."""
+    value = math.hypot(nev[0], nev[1])
+    sd = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0))
+    limit = HORIZONTAL_LIMIT * sd
+    passed = value > limit
+    verdict = "stands out of its noise" if passed else "is not distinguishable from zero"
+    figures = f"{value * _DPH:.3g} deg/h with a standard deviation of {sd * _DPH:.2g} deg/h"
+    return Check(
+        "horizontal rate", value, sd, limit, "rad/s", passed, f"the horizontal earth rate {verdict}: {figures}"
+    )
+
+
+def residuals(chi2: float, dof: int) -> Check:
+    """Return whether the residuals are as large as the noise model says, neither larger nor smaller."""
+    value = chi2 / dof
+    high, low = (float(quantile(FALSE_ALARM / 2.0, dof)) / dof for quantile in (stats.chi2.isf, stats.chi2.ppf))
+    passed = low <= value <= high
+    verdict = "fits" if passed else "does not fit"
+    sentence = f"the noise model {verdict}: residuals are {math.sqrt(value):.3g} times what it predicts"
+    return Check("residuals", value, math.sqrt(2.0 / dof), high, "1", passed, sentence)
+
+
+def agreement(name: str, difference: float, sd: float, unit: str, sd_dof: float) -> Check:
+    """Return whether an estimate agrees with what was known ahead; `unit` is "rad" or "1"."""
+    limit = float(stats.t.isf(FALSE_ALARM / 2.0, sd_dof)) * sd
+    passed = abs(difference) <= limit
+    factor, shown = (math.degrees(1.0), " deg") if unit == "rad" else (1.0, "")
+    verdict = "agrees" if passed else "does not agree"
+    figures = f"it differs by {difference * factor:.3g}{shown}, limit {limit * factor:.2g}{shown}"
+    sentence = f"the measured {name} {verdict} with the known one: {figures}"
+    return Check(name, difference, sd, limit, unit, passed, sentence)
+
+
+def closures(means: RateMeans, covariance: Array, sd_dof: float) -> list[Check]:
+    """Return the checks that need no model of the earth: opposite positions add up alike, repeated ones agree.
+
+    Parameters
+    ----------
+    means : RateMeans
+        One mean a dwell, their rates the residuals of the fit, in which a drift is already taken out.
+    covariance : (n, n) array
+        Of those means for one axis, rad^2/s^2.
+    sd_dof : float
+        Degrees of freedom behind `covariance`.
+    """
+    axes = sensitivity(means.azimuth, means.elevation, means.tilt, n_axes=means.n_axes)
+    found: dict[str, list[tuple[float, float]]] = {"pair sums": [], "repeated positions": []}
+    for axis in range(means.n_axes):
+        groups = _positions(axes[:, axis])
+        contrasts = {"pair sums": _pair_sums(groups, axes[:, axis]), "repeated positions": _repeats(groups, means.n)}
+        for name, rows in contrasts.items():
+            found[name] += [
+                (float(row @ means.rate[:, axis]), math.sqrt(max(float(row @ covariance @ row), 0.0))) for row in rows
+            ]
+    return [_closure(name, values, sd_dof) for name, values in found.items() if values]
+
+
+def _positions(axes: Array) -> list[list[int]]:
+    """Return the dwells of each position, the positions in the order they were first taken."""
+    groups: list[list[int]] = []
+    for i, axis in enumerate(axes):
+        same = [group for group in groups if np.linalg.norm(axes[group[0]] - axis) < SAME_POSITION]
+        if same:
+            same[0].append(i)
+        else:
+            groups.append([i])
+    return groups
+
+
+def _pair_sums(groups: list[list[int]], axes: Array) -> list[Array]:
+    """Return what to multiply dwell means by to get the differences of the half sums of opposite positions."""
+    opposite = [(a, b) for a, b in combinations(groups, 2) if np.linalg.norm(axes[a[0]] + axes[b[0]]) < SAME_POSITION]
+    halves = []
+    for a, b in opposite:
+        row = np.zeros(len(axes))
+        row[a], row[b] = 0.5 / len(a), 0.5 / len(b)
+        halves.append(row)
+    return [second - first for first, second in combinations(halves, 2)]
+
+
+def _repeats(groups: list[list[int]], n: int) -> list[Array]:
+    """Return what to multiply dwell means by to get the change from the first to each later visit of a position."""
+    return [np.eye(n)[later] - np.eye(n)[group[0]] for group in groups for later in group[1:]]
+
+
+def _closure(name: str, values: list[tuple[float, float]], sd_dof: float) -> Check:
+    factor = float(stats.t.isf(FALSE_ALARM / 2.0 / len(values), sd_dof))
+    value, sd = max(values, key=lambda pair: abs(pair[0]) - factor * pair[1])
+    passed = abs(value) <= factor * sd
+    verdict = "agree" if passed else "do not agree"
+    sentence = f"{name} {verdict}: largest difference {value * _DPH:.3g} deg/h, limit {factor * sd * _DPH:.2g} deg/h"
+    return Check(name, value, sd, factor * sd, "rad/s", passed, sentence)

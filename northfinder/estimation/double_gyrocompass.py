@@ -1,0 +1,283 @@
+"""Double gyrocompassing: what one triad at rest in several positions tells, its gyro biases among it.
+
+The positions of one body share the biases ``b`` of its gyros. With ``u_p`` up in the body frame, from the
+accelerometers, least squares over all positions ``p`` (docs/method.md, section 3),
+
+    w_p = b + Omega (cos lat north_p(heading_p) + sin lat u_p),
+
+finds the three biases, the latitude and one heading a position. The turns between the positions need not be known, as
+long as they were not all about the vertical; those need the turn angles, as in the source's [S1] (11) to (16).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from northfinder.errors import EstimateError
+from northfinder.estimation.triad import (
+    HEADING_SD_MAX,
+    StaticMean,
+    TriadFix,
+    axis_directions,
+    check_gravity,
+    directions,
+    gyrocompass,
+    propagated,
+    unit,
+)
+from northfinder.units import DPH, EARTH_RATE
+
+Array = NDArray[np.float64]
+#: Directions in the body frame: a level one, the one 90 deg clockwise of it seen from above, and up.
+Level = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TriadSolution:
+    """The fix from all positions together, and that from each alone."""
+
+    combined: TriadFix
+    positions: tuple[TriadFix, ...]
+
+
+def solve_triad(
+    means: Sequence[StaticMean],
+    *,
+    gyro_bias_sd: float | None = None,
+    accelerometer_bias_sd: float = 0.0,
+    latitude: float | None = None,
+    turns: ArrayLike | None = None,
+    turn_sd: float = 0.0,
+) -> TriadSolution:
+    """Return what one position says, or several by double gyrocompassing; parameters as `double_gyrocompass`.
+
+    With several positions and no `gyro_bias_sd`, the standard deviations of each position alone hold biases of the
+    size that all together show.
+
+    Raises
+    ------
+    EstimateError
+        As `double_gyrocompass` and `gyrocompass`, and if no body axis has an azimuth.
+    """
+    if not means:
+        raise EstimateError("there is no position to solve")
+    if len(means) == 1:
+        combined = gyrocompass(means[0], gyro_bias_sd=gyro_bias_sd, accelerometer_bias_sd=accelerometer_bias_sd)
+    else:
+        combined = double_gyrocompass(
+            means,
+            gyro_bias_sd=gyro_bias_sd,
+            accelerometer_bias_sd=accelerometer_bias_sd,
+            latitude=latitude,
+            turns=turns,
+            turn_sd=turn_sd,
+        )
+    if all(axis.azimuth is None for axes in combined.axes for axis in axes):
+        raise EstimateError(f"no azimuth: {max((axis.reason for axis in combined.axes[0]), key=len)}")
+    if gyro_bias_sd is None and combined.bias is not None and combined.bias_sd is not None:
+        gyro_bias_sd = math.sqrt(float(np.mean(combined.bias**2 + combined.bias_sd**2)))
+    alone = (gyrocompass(m, gyro_bias_sd=gyro_bias_sd, accelerometer_bias_sd=accelerometer_bias_sd) for m in means)
+    return TriadSolution(combined=combined, positions=tuple(alone))
+
+
+def double_gyrocompass(
+    means: Sequence[StaticMean],
+    *,
+    gyro_bias_sd: float | None = None,
+    accelerometer_bias_sd: float = 0.0,
+    latitude: float | None = None,
+    turns: ArrayLike | None = None,
+    turn_sd: float = 0.0,
+) -> TriadFix:
+    """Return latitude, common gyro biases and axis directions from several positions of one body.
+
+    Residuals larger than the noise, where there are more equations than unknowns, scale the standard deviations up.
+
+    Parameters
+    ----------
+    means : sequence of StaticMean
+        At least two positions.
+    gyro_bias_sd : float, optional
+        If given, each bias is known beforehand to be zero within it, rad/s.
+    accelerometer_bias_sd : float
+        Of the biases, common to all positions, m/s^2.
+    latitude : float, optional
+        The latitude, rad, if it is known.
+    turns : (n_positions,) array, optional
+        Known turn of each position about the vertical, clockwise from above, rad; only their differences matter.
+    turn_sd : float
+        Standard deviation of each, rad.
+
+    Raises
+    ------
+    EstimateError
+        If the positions do not determine the biases, or two sets of biases fit alike.
+    """
+    for mean in means:
+        check_gravity(mean)
+    known = _known(len(means), gyro_bias_sd, latitude, turns, turn_sd)
+    problem = _Problem(tuple(means), *known, _reference_axes(means, common=turns is not None))
+    inputs, input_sd = problem.inputs()
+    inputs, input_sd = np.append(inputs, np.zeros(3)), np.append(input_sd, np.full(3, accelerometer_bias_sd))
+    solution, ratio = _solve(problem, inputs)
+    values, sd = propagated(lambda moved: _outputs(problem, moved, solution), inputs, input_sd)
+    notes = [] if accelerometer_bias_sd else ["accelerometer biases are taken as zero"]
+    if ratio > 1.0:
+        notes.append(f"residuals are {ratio:.2f} times the noise: standard deviations are scaled up by it")
+        sd = sd * ratio
+    return TriadFix(
+        names=tuple(mean.name for mean in means),
+        axes=tuple(axis_directions(values[i : i + 6], sd[i : i + 6]) for i in range(4, len(values), 6)),
+        latitude=values[3],
+        latitude_sd=sd[3],
+        bias=values[:3] * EARTH_RATE,
+        bias_sd=sd[:3] * EARTH_RATE,
+        notes=tuple(notes),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Least squares for ``x = (bias / Omega, latitude, heading of each position)``; all rates in units of Omega.
+
+    What is known beforehand is linear: ``known @ x = value`` within ``known_sd``. The inputs are one vector: rates,
+    specific forces, known values, and the three accelerometer biases.
+    """
+
+    means: tuple[StaticMean, ...]
+    known: Array  #: shape (k, 4 + n_positions)
+    known_value: Array  #: shape (k,)
+    known_sd: Array  #: shape (k,)
+    reference: tuple[int, ...]  #: in each position the body axis whose azimuth is the heading
+
+    @property
+    def noise(self) -> float:
+        """One standard deviation for all mean rates: gyros of a triad are of a kind."""
+        return max(float(np.sqrt(np.mean([mean.rate_sd**2 for mean in self.means]))) / EARTH_RATE, 1e-9)
+
+    def inputs(self) -> tuple[Array, Array]:
+        """Return the inputs but for the accelerometer biases, and their standard deviations."""
+        rate, force = [mean.rate / EARTH_RATE for mean in self.means], [mean.specific_force for mean in self.means]
+        rate_sd, force_sd = [m.rate_sd / EARTH_RATE for m in self.means], [m.specific_force_sd for m in self.means]
+        return np.concatenate([*rate, *force, self.known_value]), np.concatenate([*rate_sd, *force_sd, self.known_sd])
+
+    def split(self, inputs: Array) -> tuple[Array, list[Level], Array]:
+        """Return rates (n_positions, 3), levels by position, known values."""
+        n = 3 * len(self.means)
+        force = inputs[n : 2 * n].reshape(-1, 3) - inputs[-3:]
+        levels = [_level(unit(f), axis) for f, axis in zip(force, self.reference, strict=True)]
+        return inputs[:n].reshape(-1, 3), levels, inputs[2 * n : -3]
+
+    def fit(self, inputs: Array, start: Array) -> tuple[Array, float, Array]:
+        """Return x, chi square and Jacobian of the least squares that begins at `start`."""
+        rate, levels, value = self.split(inputs)
+        known_sd = np.maximum(self.known_sd, 1e-7)
+        n = len(rate)
+
+        def residuals(x: Array) -> Array:
+            model = np.array([_earth(level, x[3], psi) for level, psi in zip(levels, x[4:], strict=True)])
+            return np.concatenate([(x[:3] + model - rate).ravel() / self.noise, (self.known @ x - value) / known_sd])
+
+        def jacobian(x: Array) -> Array:
+            by_x = np.zeros((n, 3, 4 + n))
+            by_x[:, :, :3] = np.eye(3)
+            for p, (level, psi) in enumerate(zip(levels, x[4:], strict=True)):
+                by_x[p, :, 3] = _earth(level, x[3] + math.pi / 2.0, psi)
+                by_x[p, :, 4 + p] = _earth((level[0], level[1], np.zeros(3)), x[3], psi + math.pi / 2.0)
+            return np.vstack([by_x.reshape(3 * n, -1) / self.noise, self.known / known_sd[:, np.newaxis]])
+
+        found = least_squares(residuals, start, jacobian, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        return found.x, 2.0 * float(found.cost), found.jac
+
+    def starts(self, inputs: Array) -> list[Array]:
+        """Return where to begin: no bias, and biases around the mean rate, with the headings these would give."""
+        rate, levels, _ = self.split(inputs)
+        centre = rate.mean(axis=0)
+        starts = []
+        for bias in [np.zeros(3), centre, *(centre + sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]:
+            vertical = np.mean([(w - bias) @ up for w, (_, _, up) in zip(rate, levels, strict=True)])
+            headings = [math.atan2(-(w - bias) @ e, (w - bias) @ n) for w, (n, e, _) in zip(rate, levels, strict=True)]
+            starts.append(np.array([*bias, math.asin(np.clip(vertical, -0.98, 0.98)), *headings]))
+        return starts
+
+
+def _known(
+    n_positions: int, gyro_bias_sd: float | None, latitude: float | None, turns: ArrayLike | None, turn_sd: float
+) -> tuple[Array, Array, Array]:
+    """Return design, values and standard deviations of what is known beforehand."""
+    unknowns = np.eye(4 + n_positions)
+    rows: list[tuple[Array, float, float]] = []
+    if gyro_bias_sd is not None:
+        rows += [(row, 0.0, gyro_bias_sd / EARTH_RATE) for row in unknowns[:3]]
+    if latitude is not None:
+        rows.append((unknowns[3], latitude, 0.0))
+    if turns is not None:
+        turned = np.asarray(turns, dtype=np.float64)
+        if turned.shape != (n_positions,):
+            raise ValueError(f"turns has shape {turned.shape}, expected one turn for each of {n_positions} positions")
+        rows += [(unknowns[4 + p] - unknowns[4], turned[p] - turned[0], turn_sd) for p in range(1, n_positions)]
+    design = np.array([row for row, _, _ in rows]).reshape(-1, 4 + n_positions)
+    return design, np.array([value for _, value, _ in rows]), np.array([sd for _, _, sd in rows])
+
+
+def _reference_axes(means: Sequence[StaticMean], *, common: bool) -> tuple[int, ...]:
+    """Return for each position a body axis far from vertical; the same one for all if `common`."""
+    vertical = np.array([np.abs(unit(mean.specific_force)) for mean in means])
+    axes = np.argmin(np.broadcast_to(vertical.max(axis=0), vertical.shape) if common else vertical, axis=1)
+    return tuple(int(axis) for axis in axes)
+
+
+def _solve(problem: _Problem, inputs: Array) -> tuple[Array, float]:
+    """Return x and the Birge ratio; raise EstimateError if the data leave x open."""
+    fits = sorted((problem.fit(inputs, start) for start in problem.starts(inputs)), key=lambda fit: fit[1])
+    alike = sorted((fit for fit in fits if fit[1] < fits[0][1] + 9.0), key=lambda fit: np.linalg.norm(fit[0][:3]))
+    x, chi_square, jacobian = alike[0]
+    singular = np.linalg.svd(jacobian, compute_uv=False)
+    if singular[-1] < max(1.0 / HEADING_SD_MAX, 1e-9 * singular[0]):
+        raise EstimateError(
+            "the positions do not determine gyro biases, latitude and headings: turn the body about a level axis, "
+            "or give the turns about the vertical, the latitude or the sd of the gyro biases"
+        )
+    sizes = np.array([np.linalg.norm(fit[0][:3]) for fit in alike])
+    apart = np.array([np.linalg.norm(fit[0][:3] - x[:3]) for fit in alike]) > 0.05
+    if np.any(apart & (sizes < 3.0 * sizes[0])):
+        other = sizes[apart].min() * EARTH_RATE / DPH
+        raise EstimateError(
+            f"gyro biases of {sizes[0] * EARTH_RATE / DPH:.1f} and of {other:.1f} deg/h fit alike: "
+            "measure one more position, or give the turns, the latitude or the sd of the gyro biases"
+        )
+    x = x.copy()
+    if math.cos(x[3]) < 0.0:
+        x[3:] = [math.pi - x[3], *(x[4:] + math.pi)]
+    x[3] = math.remainder(x[3], 2.0 * math.pi)
+    freedom = max(len(jacobian) - len(x), 1)
+    return x, math.sqrt(chi_square / freedom)
+
+
+def _outputs(problem: _Problem, inputs: Array, start: Array) -> Array:
+    """Return biases / Omega, latitude and for each position azimuth and elevation of x, y, z."""
+    x, _, _ = problem.fit(inputs, start)
+    _, levels, _ = problem.split(inputs)
+    axes = [
+        directions(math.cos(psi) * n - math.sin(psi) * e, up) for (n, e, up), psi in zip(levels, x[4:], strict=True)
+    ]
+    return np.concatenate([x[:4], *axes])
+
+
+def _level(up: Array, axis: int) -> Level:
+    """Return the horizontal direction of a body axis, the one 90 deg clockwise of it, and up."""
+    ahead = unit(np.eye(3)[axis] - up[axis] * up)
+    return ahead, np.cross(ahead, up), up
+
+
+def _earth(level: Level, latitude: float, heading: float) -> Array:
+    """Return the earth's rotation / Omega in the body frame whose level reference axis is at azimuth `heading`."""
+    ahead, right, up = level
+    north = math.cos(heading) * ahead - math.sin(heading) * right
+    return np.asarray(math.cos(latitude) * north + math.sin(latitude) * up)

@@ -1,0 +1,233 @@
+"""From interval means to a fix: ordinary or generalised least squares of the one linear model (docs/method.md, 5).
+
+Ordinary weights with the mean of each dwell are what the published method amounts to; generalised weights with short
+means are the best linear unbiased estimate for the noise model given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from northfinder.errors import EstimateError
+from northfinder.estimation import checks
+from northfinder.estimation.angles import constrain, horizontal_only, require_horizontal
+from northfinder.estimation.fix import Fix, Known
+from northfinder.estimation.geometry import EARTH_RATE, wrapped
+from northfinder.estimation.linear import (
+    Design,
+    Drift,
+    build_design,
+    half_span,
+    least_squares,
+)
+from northfinder.estimation.means import RateMeans
+from northfinder.estimation.noise import NoiseModel
+
+Array = NDArray[np.float64]
+Weights = Literal["ordinary", "generalised"]
+
+#: Residuals that a right noise model reaches less often than this put a factor on the standard deviations.
+RESCALE_BELOW = 0.01
+#: The scale factor is taken to lie this near 1 where it is not known and the earth's vertical rate must be assumed.
+_SCALE_FACTOR_SD = 0.1
+_NO_VERTICAL = "no position turns the input axis up or down, so the vertical earth rate was not measured"
+_UNKNOWN = Known()
+
+
+def estimate(
+    means: RateMeans,
+    *,
+    noise: NoiseModel | None = None,
+    known: Known = _UNKNOWN,
+    drift: Drift = "constant",
+    weights: Weights = "ordinary",
+    n_rejected: int = 0,
+) -> Fix:
+    """Estimate the azimuth of stage azimuth zero and the latitude.
+
+    Parameters
+    ----------
+    means : RateMeans
+        Means of each dwell, or shorter ones, of one axis or three.
+    noise : NoiseModel, optional
+        Of each axis. Without it the standard deviations come from the residuals.
+    known : Known
+        Latitude, scale factor and acceleration-sensitive drift rate where known, and the error of the tilt.
+    drift : {"constant", "linear", "pairs"}
+        How the bias runs; "pairs" gives every two successive dwells a bias of their own.
+    weights : {"ordinary", "generalised"}
+        Equal weights, or those of the noise model.
+    n_rejected : int
+        Means left out beforehand, for the report.
+
+    Returns
+    -------
+    Fix
+        Where the residuals are improbably large for the noise model, the standard deviations are multiplied by the
+        Birge ratio, ``sqrt(chi2/dof)``, and `Fix.rescaled_by` says so.
+
+    Raises
+    ------
+    EstimateError
+        The positions do not determine an azimuth, the horizontal earth rate is not distinguishable from zero, or
+        without a noise model no residuals are left to judge the noise by.
+    ValueError
+        Generalised weights without a noise model, or a noise model that is all zero.
+    """
+    if weights == "generalised" and noise is None:
+        raise ValueError("generalised weights need a noise model")
+    design = build_design(means, drift)
+    vertical = design.vertical
+    fit = _fit(design, noise, weights, vertical=None if vertical else _assumed_vertical(known))
+    nev, cov = _earth_rates(fit, known)
+    horizontal = require_horizontal(nev, cov)
+    constrained = constrain(nev, cov, known) if vertical else horizontal_only(nev, cov, known)
+    bias, bias_sd, slope, slope_sd = _bias_terms(design, fit)
+    residual = means.rate - (design.matrix @ fit.coefficients).reshape(means.n_axes, means.n).T
+    return Fix(
+        azimuth=wrapped(float(constrained.value[0])),
+        azimuth_sd=constrained.sd(0),
+        latitude=constrained.latitude,
+        latitude_sd=None if constrained.latitude is None else constrained.sd(1),
+        latitude_reason=_NO_VERTICAL if constrained.latitude is None else "",
+        scale_factor=constrained.scale_factor,
+        scale_factor_sd=None if constrained.scale_factor is None else constrained.sd(2),
+        bias=bias,
+        bias_sd=bias_sd,
+        drift_rate=slope,
+        drift_rate_sd=slope_sd,
+        rates=nev,
+        rates_covariance=cov,
+        residuals=residual,
+        n_means=means.n,
+        dof=fit.dof,
+        normalised_residual=fit.chi2 / fit.dof if noise is not None and fit.dof else None,
+        rescaled_by=fit.rescaled_by,
+        sd_dof=fit.sd_dof,
+        n_rejected=n_rejected,
+        checks=(horizontal, *_checks(means.with_rate(residual), fit, noise, nev, cov, known, vertical=vertical)),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    coefficients: Array  # (p,): N, E, V with the acceleration-sensitive drift rate in it, bias terms
+    covariance: Array  # (p, p)
+    chi2: float  # of the whitened residuals; without a noise model of the plain ones, rad^2/s^2
+    dof: int
+    sd_dof: float
+    rescaled_by: float
+
+
+def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: tuple[float, float] | None) -> _Fit:
+    """Solve the linear model; `vertical` is V and its sd where it is assumed, not measured."""
+    rate = design.means.rate
+    if noise is None:
+        plain = least_squares(design.matrix, rate.T.ravel(), vertical)
+        if plain.dof == 0:
+            raise EstimateError(
+                f"{design.means.n} means leave no residual to judge the noise by: give a noise model or measure more"
+            )
+        variance = plain.chi2 / plain.dof
+        cov = variance * plain.inverse @ plain.inverse.T + plain.assumed
+        return _Fit(plain.coefficients, cov, plain.chi2, plain.dof, float(plain.dof), 1.0)
+    best = least_squares(*design.whitened(noise, rate), vertical)
+    factor = _birge(best.chi2, best.dof)
+    if weights == "generalised":
+        chosen, cov = best, best.inverse @ best.inverse.T
+    else:
+        chosen = least_squares(design.matrix, rate.T.ravel(), vertical)
+        cov = _propagate(chosen.inverse, noise.covariance(design.means))
+    return _Fit(chosen.coefficients, factor**2 * cov + chosen.assumed, best.chi2, best.dof, math.inf, factor)
+
+
+def _propagate(inverse: Array, covariance: Array) -> Array:
+    """Return the covariance of the coefficients when the rows of each axis have `covariance`, axes independent."""
+    n = len(covariance)
+    blocks = (inverse[:, i : i + n] for i in range(0, inverse.shape[1], n))
+    return np.asarray(sum(block @ covariance @ block.T for block in blocks))
+
+
+def _birge(chi2: float, dof: int) -> float:
+    """Return the Birge ratio if it is improbably large, else 1."""
+    return math.sqrt(chi2 / dof) if dof and chi2 > stats.chi2.isf(RESCALE_BELOW, dof) else 1.0
+
+
+def _assumed_vertical(known: Known) -> tuple[float, float]:
+    """Return what may be assumed of V where it is not measured, and its sd; it matters only through the tilt."""
+    if known.latitude is None:  # every direction of the earth's axis alike: V is uniform within the earth rate
+        return known.acceleration_sensitive_drift_rate, EARTH_RATE / math.sqrt(3.0)
+    scale = 1.0 if known.scale_factor is None else known.scale_factor
+    scale_sd = _SCALE_FACTOR_SD if known.scale_factor is None else known.scale_factor_sd
+    spread = (scale * math.cos(known.latitude) * known.latitude_sd, math.sin(known.latitude) * scale_sd)
+    sd = math.hypot(EARTH_RATE * spread[0], EARTH_RATE * spread[1], known.acceleration_sensitive_drift_rate_sd)
+    return scale * EARTH_RATE * math.sin(known.latitude) + known.acceleration_sensitive_drift_rate, sd
+
+
+def _earth_rates(fit: _Fit, known: Known) -> tuple[Array, Array]:
+    """Return N, E, V and their covariance, with the acceleration-sensitive drift and the tilt's error allowed for."""
+    nev = fit.coefficients[:3] - np.array([0.0, 0.0, known.acceleration_sensitive_drift_rate])
+    north, east, vertical = nev
+    by_tilt = np.array([[-vertical, 0.0], [0.0, vertical], [north, -east]])
+    cov = fit.covariance[:3, :3] + known.tilt_sd**2 * by_tilt @ by_tilt.T
+    cov[2, 2] += known.acceleration_sensitive_drift_rate_sd**2
+    return nev, cov
+
+
+def _bias_terms(
+    design: Design, fit: _Fit
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Return mean bias, its sd, slope and its sd of each axis; no slope unless the drift is linear."""
+    n_axes, n_bias = design.means.n_axes, design.bias.shape[1]
+    coefficients, cov = fit.coefficients[3:], fit.covariance[3:, 3:]
+    level = np.kron(np.eye(n_axes), design.bias.mean(axis=0))
+    bias, bias_sd = level @ coefficients, np.sqrt(np.diag(level @ cov @ level.T))
+    if design.drift != "linear":
+        return tuple(bias.tolist()), tuple(bias_sd.tolist()), (), ()
+    span = half_span(design.means)
+    slope, slope_sd = coefficients[1::n_bias] / span, np.sqrt(np.diag(cov)[1::n_bias]) / span
+    return tuple(bias.tolist()), tuple(bias_sd.tolist()), tuple(slope.tolist()), tuple(slope_sd.tolist())
+
+
+def _checks(
+    residuals: RateMeans,
+    fit: _Fit,
+    noise: NoiseModel | None,
+    nev: Array,
+    covariance: Array,
+    known: Known,
+    *,
+    vertical: bool,
+) -> list[checks.Check]:
+    """Return the checks beside that of the horizontal rate; `residuals` are the means of the fit's residuals."""
+    dwells = residuals.per_dwell()
+    if noise is None:
+        per_mean = np.bincount(np.searchsorted(dwells.start, residuals.start, side="right") - 1)
+        dwell_cov = np.diag(fit.chi2 / fit.dof / per_mean)
+    else:
+        dwell_cov = noise.covariance(dwells)
+    found = checks.closures(dwells, dwell_cov, fit.sd_dof)
+    if noise is not None and fit.dof:
+        found.append(checks.residuals(fit.chi2, fit.dof))
+    if vertical:
+        found += _agreements(nev, covariance, known, fit.sd_dof)
+    return found
+
+
+def _agreements(nev: Array, covariance: Array, known: Known, sd_dof: float) -> list[checks.Check]:
+    """Return whether the latitude and the scale factor that the data alone give agree with the known ones."""
+    alone = constrain(nev, covariance, _UNKNOWN)
+    found = []
+    if known.latitude is not None:
+        sd = math.hypot(alone.sd(1), known.latitude_sd)
+        found.append(checks.agreement("latitude", alone.value[1] - known.latitude, sd, "rad", sd_dof))
+    if known.scale_factor is not None:
+        sd = math.hypot(alone.sd(2), known.scale_factor_sd)
+        found.append(checks.agreement("scale factor", alone.value[2] - known.scale_factor, sd, "1", sd_dof))
+    return found
