@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -93,6 +93,8 @@ class Recorder:
         self._blocks: list[tuple[object, ...]] = []
         self._states: list[tuple[object, ...]] = []
         self._next_write = now() + WRITE_PERIOD
+        self._failed = False
+        self._closed = False
         self.n_samples = 0
         self.n_lost = 0
         try:
@@ -126,9 +128,8 @@ class Recorder:
 
     def set_meta(self, key: str, value: object) -> None:
         """Keep `value`, anything that can be JSON, under `key`."""
-        row = (key, msgspec.json.encode(value).decode())
-        with _one_line(self.path, "written"):
-            self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", row)
+        row: tuple[object, ...] = (key, msgspec.json.encode(value).decode())
+        self._put(("INSERT OR REPLACE INTO meta VALUES (?, ?)", [row]))
 
     def add_block(self, block: RateBlock) -> None:
         """Keep a block of samples."""
@@ -160,25 +161,22 @@ class Recorder:
     def add_step(self, span: DwellSpan) -> None:
         """Keep a finished dwell."""
         self.write()
-        row = (
+        row: tuple[object, ...] = (
             span.step, span.name, span.azimuth, span.elevation, span.dwell, span.measured_azimuth,
             span.measured_elevation, span.first_index, span.stop_index, span.sample_rate,
         )  # fmt: skip
-        with _one_line(self.path, "written"):
-            self._db.execute("INSERT INTO step VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+        self._put(("INSERT INTO step VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", [row]))
 
     def add_event(self, kind: str, detail: str = "") -> None:
         """Keep that something happened now."""
         self.write()
-        with _one_line(self.path, "written"):
-            self._db.execute("INSERT INTO event (time, kind, detail) VALUES (?, ?, ?)", (self._now(), kind, detail))
+        self._put(("INSERT INTO event (time, kind, detail) VALUES (?, ?, ?)", [(self._now(), kind, detail)]))
 
     def add_fix(self, value: object) -> None:
         """Keep what was estimated."""
         self.write()
-        row = (self._now(), msgspec.json.encode(value).decode())
-        with _one_line(self.path, "written"):
-            self._db.execute("INSERT INTO fix (time, value) VALUES (?, ?)", row)
+        row: tuple[object, ...] = (self._now(), msgspec.json.encode(value).decode())
+        self._put(("INSERT INTO fix (time, value) VALUES (?, ?)", [row]))
 
     def _write_if_due(self) -> None:
         if self._now() >= self._next_write:
@@ -189,23 +187,37 @@ class Recorder:
         self._next_write = self._now() + WRITE_PERIOD
         blocks, self._blocks = self._blocks, []
         states, self._states = self._states, []
-        if not (blocks or states):
+        if blocks or states:
+            self._put(
+                ("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", blocks),
+                ("INSERT INTO stage_state VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?)", states),
+            )
+
+    def _put(self, *inserts: tuple[str, list[tuple[object, ...]]]) -> None:
+        """Write rows, all or none. Once that has failed the record is as good as closed: it takes nothing more."""
+        if self._failed:
             return
-        with _one_line(self.path, "written"):
+        try:
             self._db.execute("BEGIN")
-            self._db.executemany("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", blocks)
-            self._db.executemany("INSERT INTO stage_state VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?)", states)
+            for statement, rows in inserts:
+                self._db.executemany(statement, rows)
             self._db.execute("COMMIT")
+        except sqlite3.Error as error:
+            self._failed = True
+            with suppress(sqlite3.Error):
+                self._db.rollback()
+            raise RecordError(f"the record {self.path} cannot be written: {error}") from error
 
     def close(self) -> None:
         """Write what is left and make one file of the record. Closing twice is no error."""
+        if self._closed:
+            return
+        self._closed = True
         try:
             self.write()
-            with _one_line(self.path, "closed"):
-                self._db.execute("PRAGMA journal_mode = DELETE")
-        except RecordError as error:
-            if "closed database" not in str(error):
-                raise
+            self._db.execute("PRAGMA journal_mode = DELETE")
+        except sqlite3.Error as error:
+            raise RecordError(f"the record {self.path} cannot be closed: {error}") from error
         finally:
             self._db.close()
 
