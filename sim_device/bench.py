@@ -57,6 +57,8 @@ class Line:
         self.device = device
         self.epoch_us = 0  #: world time of the device's start
         self.room: int | None = None  #: bytes that the line can take now, None for any number; beyond, blocks are lost
+        self.spoke_us = -1  #: when the device last sent something, by its own clock
+        self.due_us = device.next_due_us()  #: when the device will next do something, in world time; None if never
         self._out = bytearray()
 
     def feed(self, data: bytes, now_us: int) -> None:
@@ -67,33 +69,41 @@ class Line:
 
     def poll(self, now_us: int) -> bytes:
         """Return what the device has sent up to `now_us`."""
-        self.bench.advance_to(now_us)
+        if now_us > self.bench.now_us:
+            self.bench.advance_to(now_us)
+        if not self._out:
+            return b""
         out = bytes(self._out)
         self._out.clear()
         return out
 
     def next_due_us(self) -> int | None:
         """Return when the device will next do something, or now if it has sent already."""
-        return self.bench.now_us if self._out else self.due_us()
-
-    def due_us(self) -> int | None:
-        """Return when the device will next do something, in world time."""
-        due = self.device.next_due_us()
-        return None if due is None else due + self.epoch_us
+        return self.bench.now_us if self._out else self.due_us
 
     def serve(self) -> None:
         """Let the device do what is due now."""
         now_us = self.bench.now_us - self.epoch_us
         if self.room is not None and isinstance(self.device, GyroDevice):
-            self._out += self.device.poll(now_us, self.room)
+            sent = self.device.poll(now_us, self.room)
         else:
-            self._out += self.device.poll(now_us)
+            sent = self.device.poll(now_us)
+        if sent:
+            self._out += sent
+            self.spoke_us = now_us
+        self._note_due()
 
     def restart(self, device: Device) -> None:
         """Go on with a device that has just started; what the old one had not yet sent is lost."""
         self.device = device
         self.epoch_us = self.bench.now_us
+        self.spoke_us = -1
         self._out.clear()
+        self._note_due()
+
+    def _note_due(self) -> None:
+        due_us = self.device.next_due_us()
+        self.due_us = None if due_us is None else due_us + self.epoch_us
 
 
 class SimBench:
@@ -149,7 +159,7 @@ class SimBench:
                 heapq.heappop(self._scheduled)[2]()
                 continue
             line.serve()
-            if line.due_us() == event[0]:
+            if line.due_us == event[0]:
                 raise RuntimeError(f"the {line.name} has been served at {event[0]} us and is due at that instant again")
         self.now_us = max(self.now_us, now_us)
 
@@ -176,7 +186,7 @@ class SimBench:
     def _next_event(self) -> tuple[int, Line | None] | None:
         found: tuple[int, Line | None] | None = (self._scheduled[0][0], None) if self._scheduled else None
         for line in self.lines:
-            due = line.due_us()
+            due = line.due_us
             if due is not None and (found is None or due < found[0]):
                 found = due, line
         return found

@@ -176,7 +176,7 @@ class Gyro:
         n = rate.shape[0]
         for axis, source in enumerate(self._noise):
             rate[:, axis] += source.read(n)
-        rate += self._temperature_bias(n)[:, np.newaxis]
+        rate += self._temperature_bias(n)
         limit = self.profile.range_dph * DPH
         self.saturated = bool(n and max(rate.max(), -rate.min()) > limit)
         if self.saturated:
@@ -186,12 +186,15 @@ class Gyro:
             rate = np.rint(rate / lsb) * lsb
         return rate
 
-    def _temperature_bias(self, n: int) -> NDArray[np.float64]:
-        """Return the bias by the temperature at the next `n` samples, rad/s, shape (n,) or (1,) if it is constant."""
+    def _temperature_bias(self, n: int) -> NDArray[np.float64] | float:
+        """Return the bias by the temperature at the next `n` samples, rad/s, shape (n, 1) unless it is constant."""
         thermal = self.profile.temperature
-        age = np.arange(self._index, self._index + n) / self.sample_rate if thermal.warm_up_rise_c else np.zeros(1)
-        self._index += n
+        begin, self._index = self._index, self._index + n
+        coefficient = thermal.bias_coefficient_dph_per_c * DPH
+        if not thermal.warm_up_rise_c:
+            return coefficient * (thermal.ambient_c - thermal.reference_c)
+        age = np.arange(begin, self._index) / self.sample_rate
         temperature = thermal.ambient_c - thermal.warm_up_rise_c * np.expm1(-age / thermal.warm_up_time_constant_s)
-        self.temperature = float(temperature[-1]) if temperature.size else self.temperature
-        change: NDArray[np.float64] = temperature - thermal.reference_c
-        return thermal.bias_coefficient_dph_per_c * DPH * change
+        self.temperature = float(temperature[-1]) if n else self.temperature
+        change: NDArray[np.float64] = temperature[:, np.newaxis] - thermal.reference_c
+        return coefficient * change

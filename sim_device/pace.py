@@ -1,0 +1,99 @@
+"""How the world's time runs against wall time while the emulator is served, at real time or faster.
+
+At 1x world time is wall time. Faster, the world never runs slower than that, and runs ahead only while the host keeps
+up: it goes from one thing that is due to the next, and holds as soon as a device has sent a stream frame that its host
+must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. So a run at full speed is a lockstep with the host. When
+the host stays away for `PATIENCE_US` of wall time, time goes on at 1x from there: a dead host trips the stage's
+watchdog as it would in reality.
+"""
+
+from __future__ import annotations
+
+import math
+
+from sim_device.bench import Line, SimBench
+
+PATIENCE_US = 50_000  #: wall time for which the world waits for the host
+HEARTBEAT_US = 100_000  #: a host acknowledges once it has seen so much device time
+MOVING_WINDOW_US = 220_000  #: stage in motion: well under its watchdog of 300 ms
+REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
+CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
+
+
+class Pace:
+    """Takes a bench through time; wall time in microseconds from the start of serving.
+
+    Parameters
+    ----------
+    bench
+        What is served.
+    speed
+        How many times real time, at least 1; inf for as fast as the hosts keep up.
+
+    """
+
+    def __init__(self, bench: SimBench, speed: float) -> None:
+        if not speed >= 1:
+            raise ValueError(f"the speed must be at least 1, got {speed:g}")
+        self._bench = bench
+        self._speed = speed
+        self._wall_us = 0
+        self._lead_us = 0  # the most by which the world has been ahead of wall time
+        self._limit_us = 0.0  # of the world, by the speed
+
+    def advance(self, wall_us: int) -> None:
+        """Let the world follow wall time at 1x, or without hosts at the speed asked for."""
+        bench = self._bench
+        passed_us, self._wall_us = wall_us - self._wall_us, wall_us
+        self._limit_us = bench.now_us + self._speed * passed_us
+        if self._speed > 1 and not self._with_host():
+            bench.advance_to(bench.now_us + passed_us if self._speed == math.inf else round(self._limit_us))
+        else:
+            bench.advance_to(self._steady_us())
+        self._lead_us = max(self._lead_us, bench.now_us - wall_us)
+
+    def run_ahead(self) -> bool:
+        """Go to what a device with a host does next, if the host keeps up; return whether the world is there now."""
+        due = self._next_us()
+        if due is None:
+            return False
+        self._bench.advance_to(round(min(due, self._limit_us)))
+        self._lead_us = max(self._lead_us, self._bench.now_us - self._wall_us)
+        return due <= self._limit_us
+
+    def wait_us(self) -> float:
+        """Return for how long, in wall time, nothing will happen unless a host says something."""
+        due = self._next_us()
+        if due is not None:
+            return (due - self._bench.now_us) / self._speed
+        next_due = self._bench.next_due_us()
+        if next_due is None:
+            return math.inf
+        behind = self._steady_us() if self._with_host() or self._speed == 1 else self._bench.now_us
+        return max(0, next_due - behind)
+
+    def _with_host(self) -> bool:
+        return any(line.device.session for line in self._bench.lines)
+
+    def _steady_us(self) -> int:
+        """Return where the world is at least, hosts or not."""
+        return self._wall_us if self._speed == 1 else self._wall_us + self._lead_us - PATIENCE_US
+
+    def _next_us(self) -> int | None:
+        """Return what the world may run ahead to, None if it has to wait."""
+        if self._speed == 1:
+            return None
+        hosted = [line for line in self._bench.lines if line.device.session]
+        due = min((line.due_us for line in hosted if line.due_us is not None), default=None)
+        return due if due is not None and all(due <= self._horizon_us(line) for line in hosted) else None
+
+    def _horizon_us(self, line: Line) -> float:
+        """Return up to when a line's host lets the world run ahead."""
+        seen_us = line.device.seen_time_us
+        if line is self._bench.gyro:
+            awaited = self._bench.gyro_board.newest_block_us >= seen_us + HEARTBEAT_US
+            return -math.inf if awaited else math.inf
+        if line.spoke_us >= seen_us + HEARTBEAT_US:
+            return -math.inf
+        in_motion = self._bench.now_us <= self._bench.plant_stage.rest_since_us() + CONTROL_US
+        return line.epoch_us + seen_us + (MOVING_WINDOW_US if in_motion else REST_WINDOW_US)

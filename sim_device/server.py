@@ -1,0 +1,210 @@
+"""Serves an emulated bench on two pseudo-terminals or TCP ports, at any speed: ``python -m sim_device``.
+
+Prints one line of JSON with the addresses, then serves until it is told to stop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import selectors
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from sim_device.bench import Line, SimBench
+from sim_device.faults import Endpoint, FaultSpec, FaultyLine, LinkFaults, link_faults, schedule
+from sim_device.pace import Pace
+from sim_device.plant.gyro import ARCSEC
+from sim_device.ports import Connection, Port, PtyPort, TcpPort
+
+LONGEST_WAIT_S = 0.05  #: between looks at whether to stop
+LOOPBACK = "127.0.0.1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServeOptions:
+    """What to serve, and how."""
+
+    profile: str = "tvg43"  #: name, or path of a TOML file
+    seed: int = 0
+    azimuth_deg: float = 0.0  #: true azimuth of stage azimuth zero
+    latitude_deg: float = 50.429
+    tilt_arcsec: tuple[float, float] = (0.0, 0.0)
+    speed: float = 1.0  #: times real time, inf for as fast as the host keeps up
+    only: str = ""  #: "gyro" or "stage", both if empty
+    tcp: str = ""  #: address to listen on, pseudo-terminals if empty
+    faults: tuple[str, ...] = ()  #: see `sim_device.faults`
+    parent_death: bool = False  #: stop when standard input ends, as it does when the parent dies
+
+
+def make_bench(options: ServeOptions) -> SimBench:
+    """Return the bench that the options describe; ValueError if they do not make sense."""
+    if not -90 <= options.latitude_deg <= 90:
+        raise ValueError(f"the latitude must be from -90 to 90 deg, got {options.latitude_deg:g}")
+    if not all(map(math.isfinite, (options.azimuth_deg, *options.tilt_arcsec))):
+        raise ValueError("azimuth and tilt must be finite numbers")
+    if options.seed < 0:
+        raise ValueError(f"the seed must not be negative, got {options.seed}")
+    return SimBench(
+        options.profile,
+        seed=options.seed,
+        azimuth=math.radians(options.azimuth_deg),
+        latitude=math.radians(options.latitude_deg),
+        tilt=(options.tilt_arcsec[0] * ARCSEC, options.tilt_arcsec[1] * ARCSEC),
+    )
+
+
+def serve(options: ServeOptions, stop: threading.Event | None = None) -> None:
+    """Serve the bench until SIGTERM or SIGINT, until `stop` is set, or, if so asked, until standard input ends.
+
+    Raises
+    ------
+    ValueError
+        If the options do not make sense.
+
+    """
+    stop = stop or threading.Event()
+    bench = make_bench(options)
+    pace = Pace(bench, options.speed)
+    specs = [FaultSpec.parse(text) for text in options.faults]
+    schedule(specs, bench)
+    lines = [line for line in (bench.gyro, bench.stage) if options.only in {"", line.name}]
+    connections = [Connection(line, _endpoint(line, specs, options.seed), _open_port(options)) for line in lines]
+    if options.parent_death:
+        threading.Thread(target=_watch_input, args=(stop,), daemon=True).start()
+    try:
+        with _stopped_by_signals(stop):
+            _announce(options, connections)
+            _run(pace, bench, connections, stop)
+    finally:
+        for connection in connections:
+            connection.port.close()
+
+
+def _run(pace: Pace, bench: SimBench, connections: list[Connection], stop: threading.Event) -> None:
+    begin = time.monotonic()
+    with selectors.DefaultSelector() as selector:
+        watched: list[int] = []
+        while not stop.is_set():
+            handles = [handle for connection in connections if connection.plugged for handle in connection.port.handles]
+            if handles != watched:
+                _watch(selector, handles)
+                watched = handles
+            selector.select(min(LONGEST_WAIT_S, pace.wait_us() * 1e-6))
+            pace.advance(round((time.monotonic() - begin) * 1e6))
+            for connection in connections:
+                connection.take_in(bench.now_us)
+            while not _bring_out(connections, bench.now_us) and pace.run_ahead():
+                pass
+
+
+def _bring_out(connections: list[Connection], now_us: int) -> bool:
+    return sum(connection.bring_out(now_us) for connection in connections) > 0
+
+
+def _watch(selector: selectors.BaseSelector, handles: list[int]) -> None:
+    for handle in list(selector.get_map()):
+        selector.unregister(handle)
+    for handle in handles:
+        selector.register(handle, selectors.EVENT_READ)
+
+
+def _endpoint(line: Line, specs: list[FaultSpec], seed: int) -> Endpoint:
+    faults = link_faults(specs, line.name)
+    return line if faults == LinkFaults() else FaultyLine(line, faults, seed)
+
+
+def _open_port(options: ServeOptions) -> Port:
+    if options.tcp:
+        return TcpPort(options.tcp)
+    try:
+        return PtyPort()
+    except (ImportError, AttributeError):
+        sys.stderr.write("there are no pseudo-terminals on this system: serving over TCP instead\n")
+        return TcpPort(LOOPBACK)
+
+
+def _announce(options: ServeOptions, connections: list[Connection]) -> None:
+    addresses = {connection.line.name: f"native:{connection.port.address}" for connection in connections}
+    facts = {
+        "profile": options.profile,
+        "seed": options.seed,
+        "azimuth_deg": options.azimuth_deg,
+        "latitude_deg": options.latitude_deg,
+        "pid": os.getpid(),
+    }
+    sys.stdout.write(json.dumps({**addresses, **facts}) + "\n")
+    sys.stdout.flush()
+
+
+def _watch_input(stop: threading.Event) -> None:
+    while sys.stdin.buffer.read(4096):
+        pass
+    stop.set()
+
+
+@contextmanager
+def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
+    """Set `stop` on SIGTERM or SIGINT, where this thread may say what signals do."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def parse_speed(text: str) -> float:
+    """Return the speed as a number: ``max`` is inf."""
+    return math.inf if text == "max" else float(text)
+
+
+def _parse_tilt(text: str) -> tuple[float, float]:
+    tilt_x, tilt_y = text.split(",")
+    return float(tilt_x), float(tilt_y)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sim_device", description="Emulate a gyro on a rotation stage.")
+    add = parser.add_argument
+    add("--profile", default="tvg43", help="profile's name, or the path of its TOML file")
+    add("--seed", type=int, default=0)
+    add("--azimuth", type=float, default=0.0, help="true azimuth of stage azimuth zero, deg")
+    add("--latitude", type=float, default=50.429, help="deg, north positive")
+    add("--tilt", type=_parse_tilt, default=(0.0, 0.0), metavar="X,Y", help="lean of the rotation axis, arcsec")
+    add("--speed", type=parse_speed, default=1.0, metavar="X|max", help="times real time, at least 1")
+    add("--only", choices=["gyro", "stage"], default="", help="serve this device alone")
+    add("--tcp", nargs="?", const=LOOPBACK, default="", metavar="HOST", help="TCP instead of pseudo-terminals")
+    add("--fault", action="append", default=[], metavar="FAULT", help="such as gyro:drop=1e-4 or stage:e-stop@30+5")
+    add("--parent-death", action="store_true", help="stop when standard input ends")
+    given = parser.parse_args(arguments)
+    options = ServeOptions(
+        profile=given.profile,
+        seed=given.seed,
+        azimuth_deg=given.azimuth,
+        latitude_deg=given.latitude,
+        tilt_arcsec=given.tilt,
+        speed=given.speed,
+        only=given.only,
+        tcp=given.tcp,
+        faults=tuple(given.fault),
+        parent_death=given.parent_death,
+    )
+    try:
+        serve(options)
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"{parser.prog}: {error}\n")
+        return 2
+    return 0
