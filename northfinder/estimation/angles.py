@@ -15,6 +15,8 @@ from northfinder.estimation.geometry import EARTH_RATE, angles, rates, rates_jac
 
 Array = NDArray[np.float64]
 
+_CONVERGED = 1e-12  # rad, and of the scale factor
+
 
 def require_horizontal(nev: Array, covariance: Array) -> checks.Check:
     """Return the check of the horizontal earth rate. Raises EstimateError if it fails: there is no azimuth then."""
@@ -51,7 +53,10 @@ def constrain(nev: Array, covariance: Array, known: Known) -> Angles:
     for _ in range(10):
         rows = np.vstack([whiten @ rates_jacobian(*value), *[row for row, _, _ in soft]])[:, free]
         misfit = [*(whiten @ (nev - rates(*value))), *[(target - row @ value * sd) / sd for row, target, sd in soft]]
-        value[free] += np.linalg.lstsq(rows, np.array(misfit), rcond=None)[0]
+        step = np.linalg.lstsq(rows, np.array(misfit), rcond=None)[0]
+        value[free] += step
+        if np.max(np.abs(step), initial=0.0) < _CONVERGED:
+            break
     require_horizontal(rates(*value), covariance)
     cov = np.zeros((3, 3))
     cov[np.ix_(free, free)] = np.linalg.inv(rows.T @ rows)

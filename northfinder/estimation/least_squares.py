@@ -215,7 +215,7 @@ def _checks(
     found = checks.closures(dwells, dwell_cov, fit.sd_dof)
     if noise is not None and fit.dof:
         found.append(checks.residuals(fit.chi2, fit.dof))
-    if vertical:
+    if vertical and known != _UNKNOWN:
         found += _agreements(nev, covariance, known, fit.sd_dof)
     return found
 
