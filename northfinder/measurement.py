@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from drivers.api import Clock, Gyro, RateBlock, Stage
 from northfinder.errors import EstimateError
@@ -46,7 +46,7 @@ class Outcome:
     n_lost: int
     duration: float  #: s from the first to the last sample
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, Any]:
         """Return it as plain data, in the units of the field."""
         return fix_to_json(self.fix) | {
             "n_samples": self.n_samples,

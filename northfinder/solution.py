@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from northfinder.errors import ConfigError
 from northfinder.estimation import Check, Fix, Known, NoiseModel, RateMeans, estimate
@@ -71,7 +71,7 @@ def solve(means: RateMeans, assumptions: Assumptions) -> Fix:
     return estimate(means.per_dwell(), noise=noise, known=known, drift=drift)
 
 
-def fix_to_json(fix: Fix) -> dict[str, object]:
+def fix_to_json(fix: Fix) -> dict[str, Any]:
     """Return the fix as plain data: angles in deg, rates in deg/h."""
     return {
         "azimuth_deg": math.degrees(fix.azimuth),

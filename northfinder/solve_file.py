@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -20,7 +21,7 @@ from northfinder.tables import DwellTable, StaticTriad, read_table
 _SQLITE = b"SQLite format 3\0"
 
 
-def solve_file(path: Path, assumptions: Assumptions | None, *, input_axis_offset: float = 0.0) -> dict[str, object]:
+def solve_file(path: Path, assumptions: Assumptions | None, *, input_axis_offset: float = 0.0) -> dict[str, Any]:
     """Return the fix from a file of any kind.
 
     Parameters
@@ -51,7 +52,7 @@ def solve_file(path: Path, assumptions: Assumptions | None, *, input_axis_offset
     return _solve_table(read_table(path), latitude, input_axis_offset)
 
 
-def solve_record(path: Path, assumptions: Assumptions | None = None) -> dict[str, object]:
+def solve_record(path: Path, assumptions: Assumptions | None = None) -> dict[str, Any]:
     """Return the fix from a record, under its own assumptions unless others are given."""
     with Record(path) as record:
         if assumptions is None:
@@ -69,9 +70,7 @@ def _kept_assumptions(record: Record) -> Assumptions:
         raise RecordError(f"the record {record.path} is damaged: its assumptions cannot be read: {error}") from None
 
 
-def _solve_table(
-    table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float
-) -> dict[str, object]:
+def _solve_table(table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float) -> dict[str, Any]:
     if isinstance(table, StaticTriad):
         means = [static_mean(position.name, position.rate, position.specific_force) for position in table.positions]
         return triad_json(solve_triad(means, latitude=latitude))

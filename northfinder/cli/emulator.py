@@ -10,6 +10,8 @@ from types import TracebackType
 from typing import Self
 
 from drivers.errors import LinkError
+from northfinder.cli import EXIT_USAGE
+from northfinder.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +50,8 @@ class EmulatorProcess:
         line = self._child.stdout.readline()
         if not line:
             reason = self._child.stderr.read().decode(errors="replace").strip().splitlines()
-            raise LinkError(f"the emulator did not start: {reason[-1] if reason else 'it said nothing'}")
+            sentence = f"the emulator did not start: {reason[-1] if reason else 'it said nothing'}"
+            raise ConfigError(sentence) if self._child.wait() == EXIT_USAGE else LinkError(sentence)
         announcement: dict[str, str] = json.loads(line)
         return announcement
 

@@ -8,25 +8,28 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
 import click
 import msgspec
 
+from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import open_gyro, open_stage
 from drivers.transport.clock import SystemClock
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.options import estimation_options
-from northfinder.cli.show import print_json, print_result
+from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.config import Config, GyroTable, StageTable, read_config
 from northfinder.cyclogram import find_cyclogram
 from northfinder.errors import ConfigError
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
+
+Device = TypeVar("Device", Gyro, Stage)
 
 
 @click.command("find")
@@ -100,8 +103,8 @@ def command(
         stop_requested = stack.enter_context(_stop_on_signal(clock))
         display = stack.enter_context(DisplayContext(clock, len(cyclogram.steps), quiet=quiet))
         measurement = Measurement(
-            open_gyro=partial(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate),
-            open_stage=partial(
+            open_gyro=lambda: _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate),
+            open_stage=lambda: _opened(
                 open_stage, config.stage.address, clock, baudrate=config.stage.baudrate, limits=config.stage.limits()
             ),
             plan=cyclogram,
@@ -116,6 +119,7 @@ def command(
         print_json(result)
     else:
         print_result(result, truth=None if truth is None else (truth.azimuth_deg, truth.latitude_deg))
+    require_trustworthy(result)
 
 
 def _bench(gyro_address: str | None, stage_address: str | None, config_file: Path | None) -> Config | None:
@@ -129,6 +133,14 @@ def _bench(gyro_address: str | None, stage_address: str | None, config_file: Pat
     if gyro_address is None or stage_address is None:
         raise ConfigError("--gyro and --stage go together: one of them is missing")
     return Config(gyro=GyroTable(address=gyro_address), stage=StageTable(address=stage_address))
+
+
+def _opened(opener: Callable[..., Device], address: str, clock: Clock, **options: object) -> Device:
+    """Open a device by its address; an address that names none is the operator's mistake."""
+    try:
+        return opener(address, clock, **options)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
 
 
 def _emulated(config: Config, emulator: EmulatorProcess) -> Config:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
 
+from northfinder.errors import EstimateError
 from northfinder.text import printable
 
 
@@ -41,6 +42,13 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     if "record" in result:
         table.add_row("record", printable(result["record"]))
     Console().print(Panel(table, title="true north", expand=False))
+
+
+def require_trustworthy(result: Mapping[str, Any]) -> None:
+    """Raise EstimateError if a check of the fix has failed; its figures have been shown, but must not be relied on."""
+    failed = [check["sentence"] for check in result.get("checks", []) if not check["passed"]]
+    if failed:
+        raise EstimateError(f"no trustworthy estimate: {failed[0]}")
 
 
 def _with_sd(value: float, sd: float) -> str:

@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from northfinder.cli.options import estimation_options
-from northfinder.cli.show import print_json, print_result
-from northfinder.errors import EstimateError
+from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.solution import Assumptions, Method
 from northfinder.solve_file import solve_file
 from northfinder.text import printable
@@ -61,9 +60,7 @@ def command(
         print_result(result)
     else:
         Console().print(_table(result))
-    failed = [check["sentence"] for check in result.get("checks", []) if not check["passed"]]
-    if failed:
-        raise EstimateError(f"no trustworthy estimate: {failed[0]}")
+    require_trustworthy(result)
 
 
 def _table(result: dict[str, Any]) -> Table:
