@@ -95,7 +95,7 @@ class FakeStageBoard(StageBoard):
         self.away = [0, 0]  # speed at which a drive runs off by itself, counts a second
         self.switch = [False, False]
         self.pressed = False
-        self.dead_reference = False
+        self.dead_side: int | None = None  # what a dead reference sensor tells
         self.path: list[tuple[int, int, int]] = []  # (time, axis, position about the reference)
 
     def position(self, axis: int) -> int:
@@ -125,7 +125,7 @@ class FakeStageBoard(StageBoard):
 
     def reference_side(self, axis: int, now_us: int) -> int:
         """Tell the side without error, unless dead."""
-        return -1 if self.dead_reference or self.position(axis) < 0 else 1
+        return self.dead_side or (-1 if self.position(axis) < 0 else 1)
 
     def overload(self, axis: int, now_us: int) -> bool:
         """Give what the test set."""

@@ -96,7 +96,7 @@ def test_self_test_takes_its_time() -> None:
 @given(st.integers(1, 39), st.sampled_from([1, 3]), st.integers(0, 2_000_000), st.integers(0, 400_000))
 def test_every_sample_arrives_once_and_in_time(block: int, n_axes: int, start_us: int, duration_us: int) -> None:
     """From start to stop each sample goes out once, with its index and time, at most a block late."""
-    host, _, _ = _connected(n_axes)
+    host, board, _ = _connected(n_axes)
     host.now_us = start_us
     host.ask(SET_CONFIG_GYRO, _config(0, block))
     host.ask(STREAM_START)
@@ -106,6 +106,7 @@ def test_every_sample_arrives_once_and_in_time(block: int, n_axes: int, start_us
         assert 0 <= (host.now_us - start_us) // PERIOD_US + 1 - sent < block
     found = host.send(request(STREAM_STOP, 3))
     assert found[-1] == reply(ACK, 3)
+    assert not board.sampling
     blocks = _blocks(host.heard)
     assert [rate for _, _, rates in blocks for rate in rates] == [
         1000 * index + axis for index in range(duration_us // PERIOD_US + 1) for axis in range(n_axes)

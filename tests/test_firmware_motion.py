@@ -72,6 +72,26 @@ def test_brake(start: int, target: int, speed: int, acceleration: int, fraction:
     assert stop.end_us - now_us <= math.ceil(speed * 1e6 / (acceleration * firmness))
 
 
+@given(st.integers(1, 1_000_000), st.integers(100, 1_000_000), st.floats(0, 1))
+def test_brake_decelerates_evenly(speed: int, deceleration: int, fraction: float) -> None:
+    """Braking from a cruise follows v t - a t^2 / 2."""
+    start_us = 10**10
+    move = trapezoid(0, 10**12, speed, 1_000_000, 0)
+    stop = brake(move, deceleration, start_us)
+    elapsed_us = round(fraction * (stop.end_us - start_us))
+    t = elapsed_us / 1e6
+    expected = speed * t - deceleration * t * t / 2
+    assert math.isclose(stop.position(start_us + elapsed_us) - stop.start, expected, rel_tol=1e-9, abs_tol=3)
+
+
+@given(positions, positions, st.floats(0, 1))
+def test_weak_brake_keeps_within_the_move(start: int, target: int, fraction: float) -> None:
+    """Even a brake too weak for the way that is left does not go beyond the target."""
+    move = trapezoid(start, target, 648_000, 324_000, 0)
+    stop = brake(move, 32_400, round(move.end_us * fraction))
+    assert min(start, target) <= stop.target <= max(start, target)
+
+
 @given(positions, positions, st.floats(0, 1), st.floats(0, 1))
 def test_brake_again(start: int, target: int, first: float, second: float) -> None:
     """Braking while braking changes nothing but rounding."""

@@ -249,8 +249,8 @@ def test_self_test_nobody_waits_for(kind: str) -> None:
     assert [body for body in host.run(1_000_000) if body[0] == 0x85] == []
     host.send(request(SELF_TEST, 4))
     host.send(hello())
-    assert [body for body in host.run(1_000_000) if body[0] == 0x85] == []
     assert host.send(request(start, 1))[0] == reply(ACK, 1)
+    assert [body for body in host.run(1_000_000) if body[0] == 0x85] == []
 
 
 #: Anything a line may deliver: noise, and valid frames of valid and invalid content.

@@ -116,13 +116,24 @@ def test_homing_again_gives_the_same_reference() -> None:
 def test_homing_needs_a_reference() -> None:
     """A dead reference sensor gives HOMING_FAILED after the range has been searched, and not before."""
     host, board = _connected()
-    board.dead_reference = True
+    board.dead_side = -1
     host.ask(HOME)
     found = host.run_to_rest()
     assert (found.state, found.fault, found.flags) == (FAULT, HOMING_FAILED, 0)
     travelled = board.axis[1]
     assert 190 * DEG < travelled < 210 * DEG
     assert host.ask(HOME) == refusal(2, 7, HOMING_FAILED)
+
+
+def test_homing_notices_a_reference_that_dies() -> None:
+    """A sensor that sticks once the edge has been met fast is found out in the slow pass."""
+    host, board = _connected()
+    host.ask(HOME)
+    while board.position(0) >= 0:
+        host.run(10_000)
+    host.run(20_000)
+    board.dead_side = 1
+    assert (host.run_to_rest(12_000_000).state, host.status.fault) == (FAULT, HOMING_FAILED)
 
 
 def test_homing_drives_off_a_limit_switch() -> None:
@@ -475,6 +486,29 @@ def test_stall_is_not_pushed_on() -> None:
     assert abs(board.axis[0] - held) < 100
     found = host.run_to_rest()
     assert (found.state, found.azimuth, found.flags) == (IDLE, 0, IN_POSITION | HOMED)
+
+
+def test_runaway_is_not_at_rest() -> None:
+    """As long as an axis runs by itself the stage is not at rest, and the fault cannot be cleared."""
+    host, board = _moving()
+    _run_away(board)
+    host.run(5_000_000)
+    assert host.ask(CLEAR_FAULT) == refusal(3, 6)
+    _cure(board)
+    host.run(200_000)
+    assert host.ask(CLEAR_FAULT) == reply(ACK, 4)
+
+
+def test_stall_freed_while_braking() -> None:
+    """An axis that comes free while the other still brakes stays where it is."""
+    host, board = _moving()
+    _block(board)
+    host.run(500_000)
+    assert host.status.fault == STALL
+    held = board.axis[0]
+    _cure(board)
+    host.run(BRAKING_US)
+    assert board.axis[0] == held
 
 
 @pytest.mark.parametrize(("overloaded", "fault"), [(True, STALL), (False, ENCODER)])

@@ -218,6 +218,5 @@ class Homing:
             self.done = True
             return
         self._side = self._board.reference_side(self._index, now_us)
-        self.failed = self._side > 0
         self._axis.go(self.edge + self._clearance, self._speeds[0], self._acceleration, now_us)
         self._step = self._seek
