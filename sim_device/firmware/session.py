@@ -88,6 +88,8 @@ class Session:
         When the last HEARTBEAT of this session came.
     request_id : int
         Number of the last request of this session.
+    n_waiting : int
+        Bytes waiting to be sent.
     """
 
     def __init__(self, board: Board, device_kind: int) -> None:
@@ -100,25 +102,24 @@ class Session:
         self._reader = FrameReader()
         self._n_ignored = 0
         self._reply = b""  # to the last request; empty while that is at work
-        self._outbox = b""
+        self._outbox: list[bytes] = []
+        self.n_waiting = 0
 
     @property
     def n_dropped(self) -> int:
         """Frames dropped: damaged, or of a type or length that no host may send."""
         return self._reader.n_dropped + self._n_ignored
 
-    @property
-    def n_waiting(self) -> int:
-        """Bytes waiting to be sent."""
-        return len(self._outbox)
-
     def send(self, encoded: bytes) -> None:
         """Put a whole frame in the queue."""
-        self._outbox += encoded
+        self._outbox.append(encoded)
+        self.n_waiting += len(encoded)
 
     def take(self) -> bytes:
         """Return all that waits to be sent, and empty the queue."""
-        out, self._outbox = self._outbox, b""
+        out = b"".join(self._outbox)
+        self._outbox = []
+        self.n_waiting = 0
         return out
 
     def read(self, data: bytes) -> list[bytes]:
