@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from drivers.api import RateBlock
 from drivers.native import NativeGyro, NativeStage
@@ -45,7 +46,7 @@ class VirtualBench:
         line = FaultyLine(getattr(self.bench, name), link_faults(self._specs, name), seed=1)
         return VirtualLink(line, self.clock, name=f"virtual {name}")
 
-    def measure(self, record: Path, plan: Cyclogram, **changes: object) -> Outcome:
+    def measure(self, record: Path, plan: Cyclogram, **changes: Any) -> Outcome:
         """Run a whole measurement on the bench; `changes` replace fields of the assumptions."""
         measurement = Measurement(
             open_gyro=self.open_gyro,
@@ -67,10 +68,10 @@ def virtual_bench(
     return VirtualBench(SimBench(profile, seed=seed, azimuth=azimuth, latitude=latitude), faults)
 
 
-def assume(profile: str | None = "tvg43", **changes: object) -> Assumptions:
+def assume(profile: str | None = "tvg43", **changes: Any) -> Assumptions:
     """Return assumptions, those of the emulated gyro unless changed."""
-    asked: dict[str, object] = {"method": "generalised", "latitude_deg": None, "g_drift_dph": None} | changes
-    return Assumptions.gather(profile=profile, **asked)  # type: ignore[arg-type]  # checked by gather's callers
+    asked: dict[str, Any] = {"method": "generalised", "latitude_deg": None, "g_drift_dph": None} | changes
+    return Assumptions.gather(profile=profile, **asked)
 
 
 class Unwatched:
