@@ -8,13 +8,11 @@ azimuth zero turned to true north (docs/method.md, section 5); azimuth and latit
 from northfinder.estimation.checks import Check
 from northfinder.estimation.closed_form import ClosedForm, solve_closed_form
 from northfinder.estimation.fix import Fix, Known
-from northfinder.estimation.geometry import EARTH_RATE
 from northfinder.estimation.least_squares import estimate
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
 
 __all__ = [
-    "EARTH_RATE",
     "Check",
     "ClosedForm",
     "Fix",

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from northfinder.errors import EstimateError
 from northfinder.estimation import checks
 from northfinder.estimation.fix import Known
-from northfinder.estimation.geometry import EARTH_RATE, angles, rates, rates_jacobian
+from northfinder.estimation.geometry import angles, rates, rates_jacobian
+from northfinder.units import EARTH_RATE
 
 Array = NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from scipy import stats
 
 from northfinder.estimation.geometry import sensitivity
 from northfinder.estimation.means import RateMeans
+from northfinder.units import DPH
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,6 @@ FALSE_ALARM = 1e-3
 HORIZONTAL_LIMIT = 3.0
 #: Input axes closer than this, rad, stand in the same position.
 SAME_POSITION = math.radians(1.0)
-_DPH = math.degrees(1.0) * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +37,7 @@ class Check:
     unit: str  #: "rad/s", "rad" or "1"
     passed: bool
     sentence: str  #: what it means, for the operator
+    decisive: bool = True  #: whether a failure makes the fix untrustworthy, rather than only less sure than expected
 
 
 def horizontal_rate(nev: Array, covariance: Array) -> Check:
@@ -46,20 +47,23 @@ def horizontal_rate(nev: Array, covariance: Array) -> Check:
     limit = HORIZONTAL_LIMIT * sd
     passed = value > limit
     verdict = "stands out of its noise" if passed else "is not distinguishable from zero"
-    figures = f"{value * _DPH:.3g} deg/h with a standard deviation of {sd * _DPH:.2g} deg/h"
+    figures = f"{value / DPH:.3g} deg/h with a standard deviation of {sd / DPH:.2g} deg/h"
     return Check(
         "horizontal rate", value, sd, limit, "rad/s", passed, f"the horizontal earth rate {verdict}: {figures}"
     )
 
 
-def residuals(chi2: float, dof: int) -> Check:
-    """Return whether the residuals are as large as the noise model says, neither larger nor smaller."""
+def residuals(name: str, chi2: float, dof: int) -> Check:
+    """Return whether the residuals are as large as the noise model says, neither larger nor smaller.
+
+    Not decisive: where they are larger the standard deviations of the fix are widened.
+    """
     value = chi2 / dof
     high, low = (float(quantile(FALSE_ALARM / 2.0, dof)) / dof for quantile in (stats.chi2.isf, stats.chi2.ppf))
     passed = low <= value <= high
     verdict = "fits" if passed else "does not fit"
-    sentence = f"the noise model {verdict}: residuals are {math.sqrt(value):.3g} times what it predicts"
-    return Check("residuals", value, math.sqrt(2.0 / dof), high, "1", passed, sentence)
+    sentence = f"the noise model {verdict}: {name} are {math.sqrt(value):.3g} times what it predicts"
+    return Check(name, value, math.sqrt(2.0 / dof), high, "1", passed, sentence, decisive=False)
 
 
 def agreement(name: str, difference: float, sd: float, unit: str, sd_dof: float) -> Check:
@@ -130,5 +134,5 @@ def _closure(name: str, values: list[tuple[float, float]], sd_dof: float) -> Che
     value, sd = max(values, key=lambda pair: abs(pair[0]) - factor * pair[1])
     passed = abs(value) <= factor * sd
     verdict = "agree" if passed else "do not agree"
-    sentence = f"{name} {verdict}: largest difference {value * _DPH:.3g} deg/h, limit {factor * sd * _DPH:.2g} deg/h"
-    return Check(name, value, sd, factor * sd, "rad/s", passed, sentence)
+    sentence = f"{name} {verdict}: largest difference {value / DPH:.3g} deg/h, limit {factor * sd / DPH:.2g} deg/h"
+    return Check(name, value, sd, factor * sd, "rad/s", passed, sentence, decisive=False)

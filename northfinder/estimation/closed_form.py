@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from northfinder.errors import EstimateError
 from northfinder.estimation import checks
-from northfinder.estimation.geometry import EARTH_RATE, angles, sensitivity
+from northfinder.estimation.geometry import angles, sensitivity
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
+from northfinder.units import EARTH_RATE
 
 Array = NDArray[np.float64]
 

@@ -63,7 +63,7 @@ class Fix:
     residuals: Array  #: (n, n_axes) rad/s, measured less modelled
     n_means: int
     dof: int  #: degrees of freedom of the residuals
-    normalised_residual: float | None  #: sum of squared whitened residuals over `dof`; None without a noise model
+    normalised_residual: float | None  #: chi2/dof of the whitened residuals; None without a noise model
     rescaled_by: float  #: factor put on the noise's standard deviations because the residuals demanded it; else 1
     sd_dof: float  #: degrees of freedom behind the standard deviations; infinite with a noise model
     n_rejected: int  #: means left out as disturbed
@@ -71,8 +71,8 @@ class Fix:
 
     @property
     def trustworthy(self) -> bool:
-        """Whether every check passed."""
-        return all(check.passed for check in self.checks)
+        """Whether every decisive check passed."""
+        return all(check.passed or not check.decisive for check in self.checks)
 
     def coverage_factor(self, probability: float = 0.95) -> float:
         """Return how many standard deviations on either side hold the truth with `probability` (Student t)."""

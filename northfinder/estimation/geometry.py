@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from northfinder.units import EARTH_RATE
 
-#: rad/s, rotation of the earth against the stars (WGS 84).
-EARTH_RATE = 7.292115e-5
+Array = NDArray[np.float64]
 
 #: Level frame (stage azimuth 0, stage azimuth 90 deg, down) to the directions that N, E and V are measured along.
 _TO_NEV = np.array([1.0, -1.0, -1.0])

@@ -18,16 +18,18 @@ from northfinder.errors import EstimateError
 from northfinder.estimation import checks
 from northfinder.estimation.angles import constrain, horizontal_only, require_horizontal
 from northfinder.estimation.fix import Fix, Known
-from northfinder.estimation.geometry import EARTH_RATE, wrapped
+from northfinder.estimation.geometry import wrapped
 from northfinder.estimation.linear import (
     Design,
     Drift,
     build_design,
     half_span,
     least_squares,
+    per_dwell,
 )
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
+from northfinder.units import EARTH_RATE
 
 Array = NDArray[np.float64]
 Weights = Literal["ordinary", "generalised"]
@@ -69,8 +71,9 @@ def estimate(
     Returns
     -------
     Fix
-        Where the residuals are improbably large for the noise model, the standard deviations are multiplied by the
-        Birge ratio, ``sqrt(chi2/dof)``, and `Fix.rescaled_by` says so.
+        Where the residuals, or those of the dwell means alone, are improbably large for the noise model, the standard
+        deviations are multiplied by the Birge ratio, ``sqrt(chi2/dof)``, and `Fix.rescaled_by` says so. The dwell
+        means show slow noise that the many short ones would outvote.
 
     Raises
     ------
@@ -123,6 +126,7 @@ class _Fit:
     dof: int
     sd_dof: float
     rescaled_by: float
+    tests: tuple[tuple[str, float, int], ...] = ()  # of the noise model: name, chi2 and dof of the residuals
 
 
 def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: tuple[float, float] | None) -> _Fit:
@@ -138,13 +142,18 @@ def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: t
         cov = variance * plain.inverse @ plain.inverse.T + plain.assumed
         return _Fit(plain.coefficients, cov, plain.chi2, plain.dof, float(plain.dof), 1.0)
     best = least_squares(*design.whitened(noise, rate), vertical)
-    factor = _birge(best.chi2, best.dof)
+    tests = [("residuals", best.chi2, best.dof)]
+    if (dwells := per_dwell(design)) is not None:
+        slow = least_squares(*dwells.whitened(noise, dwells.means.rate), vertical)
+        tests.append(("residuals between dwells", slow.chi2, slow.dof))
     if weights == "generalised":
         chosen, cov = best, best.inverse @ best.inverse.T
     else:
         chosen = least_squares(design.matrix, rate.T.ravel(), vertical)
         cov = _propagate(chosen.inverse, noise.covariance(design.means))
-    return _Fit(chosen.coefficients, factor**2 * cov + chosen.assumed, best.chi2, best.dof, math.inf, factor)
+    factor = max(_birge(chi2, dof) for _, chi2, dof in tests)
+    cov = factor**2 * cov + chosen.assumed
+    return _Fit(chosen.coefficients, cov, best.chi2, best.dof, math.inf, factor, tuple(tests))
 
 
 def _propagate(inverse: Array, covariance: Array) -> Array:
@@ -213,8 +222,7 @@ def _checks(
     else:
         dwell_cov = noise.covariance(dwells)
     found = checks.closures(dwells, dwell_cov, fit.sd_dof)
-    if noise is not None and fit.dof:
-        found.append(checks.residuals(fit.chi2, fit.dof))
+    found += [checks.residuals(name, chi2, dof) for name, chi2, dof in fit.tests if dof]
     if vertical and known != _UNKNOWN:
         found += _agreements(nev, covariance, known, fit.sd_dof)
     return found

@@ -75,6 +75,15 @@ def build_design(means: RateMeans, drift: Drift) -> Design:
     return Design(means, h, bias, drift, vertical=_check_determined(_stack(h, bias)))
 
 
+def per_dwell(design: Design) -> Design | None:
+    """Return the design of the dwell means of `design`; None if they are the same, or too few to leave a residual."""
+    means = design.means.per_dwell()
+    unknowns = 3 + means.n_axes * design.bias.shape[1]
+    if means.n == design.means.n or means.n * means.n_axes <= unknowns:
+        return None
+    return build_design(means, design.drift)
+
+
 def reduced_time(means: RateMeans) -> Array:
     """Return the time of each mean from the middle of the data, over `half_span`."""
     return (means.middle - np.mean(means.middle)) / half_span(means)

@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from northfinder.estimation.means import RateMeans
+from northfinder.units import DPH
 
 Array = NDArray[np.float64]
 
-_DEG = math.pi / 180.0
-_HOUR = 3600.0
+_HOUR = 3600.0  # s
 _RATIO = 4.0  # of neighbouring time constants: the ripple of the sum is 0.2 % of B^2/pi
 _FASTEST = 0.1  # of the shortest interval
 _SLOWEST = 10.0  # of the whole span
@@ -68,11 +68,11 @@ class NoiseModel:
     ) -> NoiseModel:
         """Return the model from a data sheet's units: deg/h*s, deg/sqrt(h), deg/h, deg/h/sqrt(h), deg/h/h."""
         return cls(
-            angle_white_noise=angle_white_noise_dph_s * _DEG / _HOUR,
-            angle_random_walk=angle_random_walk_deg_per_sqrt_h * _DEG / math.sqrt(_HOUR),
-            bias_instability=bias_instability_dph * _DEG / _HOUR,
-            rate_random_walk=rate_random_walk_dph_per_sqrt_h * _DEG / _HOUR / math.sqrt(_HOUR),
-            rate_ramp=rate_ramp_dph_per_h * _DEG / _HOUR**2,
+            angle_white_noise=angle_white_noise_dph_s * DPH,
+            angle_random_walk=angle_random_walk_deg_per_sqrt_h * math.radians(1.0) / math.sqrt(_HOUR),
+            bias_instability=bias_instability_dph * DPH,
+            rate_random_walk=rate_random_walk_dph_per_sqrt_h * DPH / math.sqrt(_HOUR),
+            rate_ramp=rate_ramp_dph_per_h * DPH / _HOUR,
         )
 
     def allan_deviation(self, tau: ArrayLike) -> Array:

@@ -1,0 +1,34 @@
+"""Disturbed means: steps, wind and knocks found by their distance from the rest of their dwell, whatever the noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from northfinder.estimation.means import RateMeans
+
+Array = NDArray[np.float64]
+
+#: Means this many robust standard deviations from the median of their dwell are disturbed: two in a million good ones.
+LIMIT = 5.0
+#: A dwell with fewer means cannot tell which of them is wrong.
+ENOUGH = 5
+_SD_OF_MEDIAN_DEVIATION = 1.4826  # of Gaussian noise (Rousseeuw and Croux, J. Am. Stat. Assoc. 88, 1993, p. 1273)
+
+
+def undisturbed(means: RateMeans, *, limit: float = LIMIT) -> NDArray[np.bool_]:
+    """Return which means to keep, shape (n,): those near the median of their dwell on every axis.
+
+    The scale is the median absolute deviation over all dwells, times the square root of the duration where the means
+    are not equally long; up to half of the means may be disturbed without spoiling it. Use with `RateMeans.select`.
+    """
+    _, dwell = np.unique(means.dwell, return_inverse=True)
+    judged = np.bincount(dwell)[dwell] >= ENOUGH
+    if not judged.any():
+        return np.ones(means.n, dtype=bool)
+    median = np.array([np.median(means.rate[dwell == i], axis=0) for i in range(dwell[-1] + 1)])
+    length = np.sqrt(means.duration / np.median(means.duration))[:, np.newaxis]
+    distance = np.abs(means.rate - median[dwell]) * length
+    scale = _SD_OF_MEDIAN_DEVIATION * np.median(distance[judged], axis=0)
+    rounding = np.finfo(np.float64).eps * np.max(np.abs(means.rate))
+    return np.asarray(~judged | np.all(distance <= limit * scale + rounding, axis=1))
