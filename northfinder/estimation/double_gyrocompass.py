@@ -34,7 +34,7 @@ from northfinder.estimation.triad import (
 from northfinder.units import DPH, EARTH_RATE
 
 Array = NDArray[np.float64]
-#: Directions in the body frame: a level one, the one 90 deg clockwise of it seen from above, and up.
+#: In the body frame of each position, (n, 3) each: a level direction, that 90 deg clockwise of it from above, and up.
 Level = tuple[Array, Array, Array]
 
 
@@ -167,29 +167,31 @@ class _Problem:
         rate_sd, force_sd = [m.rate_sd / EARTH_RATE for m in self.means], [m.specific_force_sd for m in self.means]
         return np.concatenate([*rate, *force, self.known_value]), np.concatenate([*rate_sd, *force_sd, self.known_sd])
 
-    def split(self, inputs: Array) -> tuple[Array, list[Level], Array]:
-        """Return rates (n_positions, 3), levels by position, known values."""
+    def split(self, inputs: Array) -> tuple[Array, Level, Array]:
+        """Return rates (n_positions, 3), level directions of each position, known values."""
         n = 3 * len(self.means)
-        force = inputs[n : 2 * n].reshape(-1, 3) - inputs[-3:]
-        levels = [_level(unit(f), axis) for f, axis in zip(force, self.reference, strict=True)]
-        return inputs[:n].reshape(-1, 3), levels, inputs[2 * n : -3]
+        up = inputs[n : 2 * n].reshape(-1, 3) - inputs[-3:]
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        axis = np.eye(3)[list(self.reference)]
+        ahead = axis - np.sum(axis * up, axis=1, keepdims=True) * up
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        return inputs[:n].reshape(-1, 3), (ahead, np.cross(ahead, up), up), inputs[2 * n : -3]
 
     def fit(self, inputs: Array, start: Array) -> tuple[Array, float, Array]:
         """Return x, chi square and Jacobian of the least squares that begins at `start`."""
-        rate, levels, value = self.split(inputs)
+        rate, level, value = self.split(inputs)
         known_sd = np.maximum(self.known_sd, 1e-7)
         n = len(rate)
 
         def residuals(x: Array) -> Array:
-            model = np.array([_earth(level, x[3], psi) for level, psi in zip(levels, x[4:], strict=True)])
-            return np.concatenate([(x[:3] + model - rate).ravel() / self.noise, (self.known @ x - value) / known_sd])
+            misfit = x[:3] + _earth(level, x[3], x[4:]) - rate
+            return np.concatenate([misfit.ravel() / self.noise, (self.known @ x - value) / known_sd])
 
         def jacobian(x: Array) -> Array:
             by_x = np.zeros((n, 3, 4 + n))
             by_x[:, :, :3] = np.eye(3)
-            for p, (level, psi) in enumerate(zip(levels, x[4:], strict=True)):
-                by_x[p, :, 3] = _earth(level, x[3] + math.pi / 2.0, psi)
-                by_x[p, :, 4 + p] = _earth((level[0], level[1], np.zeros(3)), x[3], psi + math.pi / 2.0)
+            by_x[:, :, 3] = _earth(level, x[3] + math.pi / 2.0, x[4:])
+            by_x[range(n), :, range(4, 4 + n)] = math.cos(x[3]) * _north(level, x[4:] + math.pi / 2.0)
             return np.vstack([by_x.reshape(3 * n, -1) / self.noise, self.known / known_sd[:, np.newaxis]])
 
         found = least_squares(residuals, start, jacobian, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
@@ -197,12 +199,12 @@ class _Problem:
 
     def starts(self, inputs: Array) -> list[Array]:
         """Return where to begin: no bias, and biases around the mean rate, with the headings these would give."""
-        rate, levels, _ = self.split(inputs)
+        rate, (ahead, right, up), _ = self.split(inputs)
         centre = rate.mean(axis=0)
         starts = []
         for bias in [np.zeros(3), centre, *(centre + sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]:
-            vertical = np.mean([(w - bias) @ up for w, (_, _, up) in zip(rate, levels, strict=True)])
-            headings = [math.atan2(-(w - bias) @ e, (w - bias) @ n) for w, (n, e, _) in zip(rate, levels, strict=True)]
+            vertical = np.mean(np.sum((rate - bias) * up, axis=1))
+            headings = np.arctan2(-np.sum((rate - bias) * right, axis=1), np.sum((rate - bias) * ahead, axis=1))
             starts.append(np.array([*bias, math.asin(np.clip(vertical, -0.98, 0.98)), *headings]))
         return starts
 
@@ -263,21 +265,16 @@ def _solve(problem: _Problem, inputs: Array) -> tuple[Array, float]:
 def _outputs(problem: _Problem, inputs: Array, start: Array) -> Array:
     """Return biases / Omega, latitude and for each position azimuth and elevation of x, y, z."""
     x, _, _ = problem.fit(inputs, start)
-    _, levels, _ = problem.split(inputs)
-    axes = [
-        directions(math.cos(psi) * n - math.sin(psi) * e, up) for (n, e, up), psi in zip(levels, x[4:], strict=True)
-    ]
+    _, level, _ = problem.split(inputs)
+    axes = [directions(north, up) for north, up in zip(_north(level, x[4:]), level[2], strict=True)]
     return np.concatenate([x[:4], *axes])
 
 
-def _level(up: Array, axis: int) -> Level:
-    """Return the horizontal direction of a body axis, the one 90 deg clockwise of it, and up."""
-    ahead = unit(np.eye(3)[axis] - up[axis] * up)
-    return ahead, np.cross(ahead, up), up
+def _north(level: Level, heading: Array) -> Array:
+    """Return north in the body frame of each position, with the level reference axis at azimuth `heading`."""
+    return np.asarray(np.cos(heading)[:, np.newaxis] * level[0] - np.sin(heading)[:, np.newaxis] * level[1])
 
 
-def _earth(level: Level, latitude: float, heading: float) -> Array:
-    """Return the earth's rotation / Omega in the body frame whose level reference axis is at azimuth `heading`."""
-    ahead, right, up = level
-    north = math.cos(heading) * ahead - math.sin(heading) * right
-    return np.asarray(math.cos(latitude) * north + math.sin(latitude) * up)
+def _earth(level: Level, latitude: float, heading: Array) -> Array:
+    """Return the earth's rotation / Omega in the body frame of each position."""
+    return math.cos(latitude) * _north(level, heading) + math.sin(latitude) * level[2]

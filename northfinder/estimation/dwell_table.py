@@ -77,6 +77,8 @@ def solve_dwell_table(
         distinguishable from zero.
     """
     azimuth, elevation, rate = (np.asarray(a, dtype=np.float64) for a in (azimuth, elevation, rate))
+    if len(rate) < 2:
+        raise EstimateError(f"{len(rate)} dwells are too few, expected at least 4")
     design = sensitivity(azimuth + input_axis_offset, elevation, np.zeros((len(rate), 2)))[:, 0, :]
     n_unknowns = 3 if np.ptp(elevation) > _MIN_ELEVATION_SPAN else 2
     h = design[:, :n_unknowns]
@@ -134,7 +136,7 @@ def _least_squares(design: Array, values: Array, *, n_lost: int = 0) -> tuple[Ar
     if freedom < 1:
         raise EstimateError(f"{len(values)} differences of dwells are too few for {design.shape[1]} rates and their sd")
     singular = np.linalg.svd(design, compute_uv=False)
-    if singular[-1] < 1e-3 * singular[0]:
+    if singular[-1] <= 1e-3 * singular[0]:
         raise EstimateError("the dwells do not tell north from east: more stage azimuths are needed")
     inverse = np.asarray(np.linalg.inv(design.T @ design), dtype=np.float64)
     solution = inverse @ design.T @ values
