@@ -145,7 +145,8 @@ def _announce(options: ServeOptions, connections: list[Connection]) -> None:
 
 
 def _watch_input(stop: threading.Event) -> None:
-    while sys.stdin.buffer.read(4096):
+    # Not through sys.stdin: a thread waiting inside its buffer holds up the end of the process by a second.
+    while os.read(sys.stdin.fileno(), 4096):
         pass
     stop.set()
 
