@@ -56,7 +56,7 @@ def test_errors_are_as_large_as_stated(azimuth_deg: float, latitude: float, weig
     )
     consistent([(fix.scale_factor or 0.0) - 1.0 for fix in fixes], [fix.scale_factor_sd or 0.0 for fix in fixes])
     rescaled = sum(fix.rescaled_by > 1.0 for fix in fixes)
-    assert rescaled < 0.01 * N_RUNS + 4.0 * math.sqrt(0.01 * N_RUNS)
+    assert rescaled < 0.04 * N_RUNS + 4.0 * math.sqrt(0.04 * N_RUNS)  # two tests, 2 % each
 
 
 def test_known_quantities_with_errors_of_their_own_keep_the_coverage() -> None:
@@ -101,6 +101,20 @@ def test_half_the_noise_in_the_model_still_covers() -> None:
     ratio = np.abs(azimuth_errors(fixes, 45.0)) / np.array([fix.azimuth_sd for fix in fixes])
     assert np.mean(ratio < 1.96) > 0.93 - 2.0 * math.sqrt(0.05 / N_RUNS)
     assert np.mean([fix.rescaled_by > 1.5 for fix in fixes]) > 0.95
+
+
+def test_slow_noise_that_the_model_lacks_shows_between_the_dwells() -> None:
+    """The dwell means betray a model that holds the angle noise alone, and the interval still covers."""
+    means = make_means(45.0, 50.0, mean=5.0)
+    drawn = draw_noise(np.random.default_rng(14), means, 100, sample_rate=2.0, **TVG43)
+    fast = {"bias_instability_dph": 0.0, "rate_random_walk_dph_per_sqrt_h": 0.0}
+    noise = NoiseModel.from_field_units(**TVG43 | fast)
+    fixes = [estimate(means.with_rate(means.rate[:, 0] + x), noise=noise, weights="generalised") for x in drawn]
+    failed = [{check.name for check in fix.checks if not check.passed} for fix in fixes]
+    assert np.mean(["residuals between dwells" in names for names in failed]) > 0.8
+    ratio = np.abs(azimuth_errors(fixes, 45.0)) / np.array([fix.azimuth_sd for fix in fixes])
+    covered = float(np.mean(ratio < np.array([fix.coverage_factor() for fix in fixes])))
+    assert covered > 0.95 - 3.0 * math.sqrt(0.05 / 100)
 
 
 def test_azimuth_sd_grows_as_the_secant_of_the_latitude() -> None:

@@ -65,7 +65,7 @@ class Fix:
     dof: int  #: degrees of freedom of the residuals
     normalised_residual: float | None  #: chi2/dof of the whitened residuals; None without a noise model
     rescaled_by: float  #: factor put on the noise's standard deviations because the residuals demanded it; else 1
-    sd_dof: float  #: degrees of freedom behind the standard deviations; infinite with a noise model
+    sd_dof: float  #: degrees of freedom behind the standard deviations; infinite with a noise model that fits
     n_rejected: int  #: means left out as disturbed
     checks: tuple[Check, ...]
 

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 Weights = Literal["ordinary", "generalised"]
 
 #: Residuals that a right noise model reaches less often than this put a factor on the standard deviations.
-RESCALE_BELOW = 0.01
+RESCALE_BELOW = 0.02
 #: The scale factor is taken to lie this near 1 where it is not known and the earth's vertical rate must be assumed.
 _SCALE_FACTOR_SD = 0.1
 _NO_VERTICAL = "no position turns the input axis up or down, so the vertical earth rate was not measured"
@@ -151,9 +151,9 @@ def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: t
     else:
         chosen = least_squares(design.matrix, rate.T.ravel(), vertical)
         cov = _propagate(chosen.inverse, noise.covariance(design.means))
-    factor = max(_birge(chi2, dof) for _, chi2, dof in tests)
+    factor, sd_dof = max((_birge(chi2, dof) for _, chi2, dof in tests), key=lambda ratio: ratio[0])
     cov = factor**2 * cov + chosen.assumed
-    return _Fit(chosen.coefficients, cov, best.chi2, best.dof, math.inf, factor, tuple(tests))
+    return _Fit(chosen.coefficients, cov, best.chi2, best.dof, sd_dof, factor, tuple(tests))
 
 
 def _propagate(inverse: Array, covariance: Array) -> Array:
@@ -163,9 +163,11 @@ def _propagate(inverse: Array, covariance: Array) -> Array:
     return np.asarray(sum(block @ covariance @ block.T for block in blocks))
 
 
-def _birge(chi2: float, dof: int) -> float:
-    """Return the Birge ratio if it is improbably large, else 1."""
-    return math.sqrt(chi2 / dof) if dof and chi2 > stats.chi2.isf(RESCALE_BELOW, dof) else 1.0
+def _birge(chi2: float, dof: int) -> tuple[float, float]:
+    """Return the Birge ratio and its degrees of freedom if it is improbably large, else 1 and infinity."""
+    if dof == 0 or chi2 <= stats.chi2.isf(RESCALE_BELOW, dof):
+        return 1.0, math.inf
+    return math.sqrt(chi2 / dof), float(dof)
 
 
 def _assumed_vertical(known: Known) -> tuple[float, float]:
@@ -221,7 +223,7 @@ def _checks(
         dwell_cov = np.diag(fit.chi2 / fit.dof / per_mean)
     else:
         dwell_cov = noise.covariance(dwells)
-    found = checks.closures(dwells, dwell_cov, fit.sd_dof)
+    found = checks.closures(dwells, dwell_cov, fit.sd_dof if noise is None else math.inf)
     found += [checks.residuals(name, chi2, dof) for name, chi2, dof in fit.tests if dof]
     if vertical and known != _UNKNOWN:
         found += _agreements(nev, covariance, known, fit.sd_dof)
