@@ -367,8 +367,9 @@ def test_each_block_of_a_gyro_is_acknowledged() -> None:
     bench.gyro.connect()
     bench.gyro.start()
     blocks = bench.stream(5.0)
-    seen = {parse(body).seen_time_us / 1e6 for _, body in bench.gyro_tap.requests(MessageType.HEARTBEAT)}
-    assert {block.device_time for block in blocks} <= seen
+    beats = bench.gyro_tap.requests(MessageType.HEARTBEAT)
+    told = {(at_us / 1e6, parse(body).seen_time_us / 1e6) for at_us, body in beats}
+    assert {(block.arrival_time, block.device_time) for block in blocks[1:]} <= told
 
 
 def test_a_reset_gyro_falls_silent_and_is_seen() -> None:
@@ -385,6 +386,7 @@ def test_a_reset_gyro_falls_silent_and_is_seen() -> None:
     with pytest.raises(ProtocolError, match="refused STREAM_STOP: NO_SESSION, the device was reset"):
         bench.gyro.stop()
     assert bench.gyro.connect().boot_count == first.boot_count + 1
+    assert parse(bench.gyro_tap.requests(MessageType.GET_CONFIG)[-1][1]).request_id == 1
     bench.gyro.start()
     assert bench.stream(1.0)[0].first_index == 0
 

@@ -153,10 +153,13 @@ def test_a_closed_link_says_so(pty: Pty) -> None:
 @posix
 def test_nobody_at_the_other_end_blocks_nothing(pty: Pty) -> None:
     """A line that takes no more bytes is a LinkError within about a second, not a hang; close does not hang either."""
-    link = open_link(pty.path, SystemClock())
+    clock = SystemClock()
+    link = open_link(pty.path, clock)
+    begun = clock.now()
     with pytest.raises(LinkError, match="takes no more bytes"):
         link.write(bytes(4096 * 1000))
     link.close()
+    assert clock.now() - begun < PATIENCE
 
 
 @posix
