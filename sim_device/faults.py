@@ -38,7 +38,7 @@ RUNAWAY_SPEED = math.radians(5.0)  #: rad/s
 ENCODER_JUMP = math.radians(5.0)  #: rad
 GARBAGE_BYTES = 32  #: at most
 
-_SPEC = re.compile(r"(gyro|stage):([a-z-]+)(?:=([^@]+))?(?:@([0-9.]+)(?:\+([0-9.]+))?)?")
+_SPEC = re.compile(r"(gyro|stage):([a-z-]+)(?:=([^@]+))?(?:@(\d+(?:\.\d+)?)(?:\+(\d+(?:\.\d+)?))?)?")
 
 
 class Endpoint(Protocol):

@@ -84,6 +84,7 @@ class FakeStageBoard(StageBoard):
     cable_wrap = 400 * DEG
     max_speed = 18 * DEG
     max_acceleration = 9 * DEG
+    stop_deceleration = 9 * DEG
 
     def __init__(self, azimuth: int = 0, elevation: int = 0) -> None:
         self.power_up = (azimuth, elevation)

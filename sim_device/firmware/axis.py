@@ -66,8 +66,8 @@ class Axis:
         self.profile = trapezoid(self._command, target, speed, acceleration, now_us)
 
     def brake(self, now_us: int) -> None:
-        """Come to rest at the greatest deceleration."""
-        self.profile = brake(self.profile, self._board.max_acceleration, now_us)
+        """Come to rest as fast as the board may."""
+        self.profile = brake(self.profile, self._board.stop_deceleration, now_us)
 
     def hold(self, now_us: int) -> None:
         """Stay where the encoder says that the axis is."""

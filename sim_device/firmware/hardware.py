@@ -72,6 +72,7 @@ class StageBoard(Board):
     cable_wrap = 0  # either side of the reference, azimuth
     max_speed = 0
     max_acceleration = 0
+    stop_deceleration = 0  # how hard STOP and a fault may brake an axis
     control_period_us = 10_000  # the firmware commands the drives this often while the stage is not at rest
 
     def drive(self, axis: int, position: int, now_us: int) -> None:

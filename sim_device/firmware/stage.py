@@ -50,6 +50,12 @@ def _i32(value: int) -> int:
     return max(-0x80000000, min(value, 0x7FFFFFFF))
 
 
+def _default_watchdog_ms(board: StageBoard) -> int:
+    """Return the time that leaves the stage at rest 300 ms after the last heartbeat, if its brakes are up to it."""
+    braking_ms = 1000 * board.max_speed // board.stop_deceleration
+    return 300 - braking_ms if braking_ms <= 200 else 300
+
+
 class StageDevice(Device):
     """A stage on the line.
 
@@ -83,7 +89,7 @@ class StageDevice(Device):
             board.max_speed,
             board.max_acceleration,
             100,
-            300,
+            _default_watchdog_ms(board),
         )
         self._handlers = {
             GET_CONFIG: self._get_config,

@@ -160,6 +160,7 @@ class SimStageBoard(StageBoard):
         self.cable_wrap = _counts(profile.cable_wrap_deg * 3600)
         self.max_speed = _counts(profile.max_speed_deg_per_s * 3600)
         self.max_acceleration = _counts(profile.max_acceleration_deg_per_s2 * 3600)
+        self.stop_deceleration = _counts(profile.stop_deceleration_deg_per_s2 * 3600)
         self.self_test_failures = 0  #: fault hook: bits of SELF_TEST_RESULT
         self._epoch_us = epoch_us
         self._motor_zero = [axis.motor_angle(epoch_us) for axis in stage.axes]

@@ -98,6 +98,7 @@ class StageProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     model: Text16
     max_speed_deg_per_s: Positive
     max_acceleration_deg_per_s2: Positive
+    stop_deceleration_deg_per_s2: Positive  #: of STOP and faults
     cable_wrap_deg: Positive  #: azimuth, either side of the reference
     azimuth: AxisProfile
     elevation: AxisProfile
