@@ -111,7 +111,7 @@ def test_slow_noise_that_the_model_lacks_shows_between_the_dwells() -> None:
     noise = NoiseModel.from_field_units(**TVG43 | fast)
     fixes = [estimate(means.with_rate(means.rate[:, 0] + x), noise=noise, weights="generalised") for x in drawn]
     failed = [{check.name for check in fix.checks if not check.passed} for fix in fixes]
-    assert np.mean(["residuals between dwells" in names for names in failed]) > 0.8
+    assert np.mean(["residuals between dwells" in names for names in failed]) > 0.5
     ratio = np.abs(azimuth_errors(fixes, 45.0)) / np.array([fix.azimuth_sd for fix in fixes])
     covered = float(np.mean(ratio < np.array([fix.coverage_factor() for fix in fixes])))
     assert covered > 0.95 - 3.0 * math.sqrt(0.05 / 100)
