@@ -127,9 +127,12 @@ def test_unplugging_is_named(pty: Pty) -> None:
     """What came before the unplugging can be read; then every call names the port, and the wait ends at once."""
     clock = SystemClock()
     link = open_link(pty.path, clock)
+    assert isinstance(link, SerialLink)
     pty.write(b"last words")
-    assert receive(link, clock, 10) == b"last words"
+    clock.wait(clock.now() + PATIENCE)  # the reader has them
     pty.unplug()
+    link._reader.join(PATIENCE)
+    assert link.receive() == b"last words"
     assert until_lost(link, clock).startswith(f"{pty.path} was unplugged")
     with pytest.raises(LinkError, match="was unplugged"):
         link.write(b"x")
