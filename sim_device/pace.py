@@ -15,7 +15,7 @@ from sim_device.bench import Line, SimBench
 
 PATIENCE_US = 50_000  #: wall time for which the world waits for the host
 HEARTBEAT_US = 100_000  #: a host acknowledges once it has seen so much device time
-MOVING_WINDOW_US = 220_000  #: stage in motion: well under its watchdog of 300 ms
+MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
 CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
 

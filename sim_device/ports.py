@@ -94,18 +94,10 @@ class TcpPort:
         return (self._listener.fileno(), *client)
 
     def receive(self) -> bytes:
-        """Return what the host has sent, after seeing who has come or gone."""
-        self._accept()
-        if self._client is None:
-            return b""
-        try:
-            data = self._client.recv(READ_SIZE)
-        except BlockingIOError:
-            return b""
-        except OSError:
-            data = b""
+        """Return what the host has sent. A host that has gone makes room for the next."""
+        data = self._read()
         if not data:
-            self._hang_up()
+            self._accept()
         return data
 
     def send(self, data: bytes) -> int:
@@ -124,6 +116,19 @@ class TcpPort:
         """Hang up and listen no more."""
         self._hang_up()
         self._listener.close()
+
+    def _read(self) -> bytes:
+        if self._client is None:
+            return b""
+        try:
+            data = self._client.recv(READ_SIZE)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
 
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError):

@@ -1,0 +1,336 @@
+"""The emulator as a process of its own: on pseudo-terminals and TCP, at real time and as fast as its host."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import math
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from raw_host import (
+    FAULT,
+    HOME,
+    IDENTITY,
+    IDLE,
+    MOVING,
+    SAMPLES,
+    SELF_TEST,
+    STAGE_STATUS,
+    STREAM_START,
+    RawPort,
+    Samples,
+    heartbeat,
+    hello,
+    parse_samples,
+    parse_status,
+    request,
+)
+
+from sim_device.bench import SimBench
+from sim_device.pace import PATIENCE_US, Pace
+
+ROOT = Path(__file__).parents[1]
+
+Server = tuple["subprocess.Popen[str]", dict[str, Any]]
+Start = Callable[..., Server]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Return a function that starts the emulator with options and gives the process and what it announced."""
+    with contextlib.ExitStack() as stack:
+
+        def begin(*options: str) -> Server:
+            command = [sys.executable, "-m", "sim_device", "--parent-death", *options]
+            pipe = subprocess.PIPE
+            process = stack.enter_context(
+                subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+            )
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            return process, json.loads(process.stdout.readline())
+
+        yield begin
+
+
+@contextlib.contextmanager
+def opened(address: str) -> Iterator[RawPort]:
+    """Open an address for a while."""
+    port = RawPort(address)
+    try:
+        yield port
+    finally:
+        port.close()
+
+
+def test_announces_itself(start: Start) -> None:
+    """One line of JSON says where the devices are and what world they are in; SIGTERM ends it in order."""
+    process, facts = start("--profile", "ideal", "--seed", "7", "--azimuth", "33", "--latitude", "-65")
+    assert facts.pop("gyro").startswith("native:/dev/")
+    assert facts.pop("stage").startswith("native:/dev/")
+    assert facts == {"profile": "ideal", "seed": 7, "azimuth_deg": 33.0, "latitude_deg": -65.0, "pid": process.pid}
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=5) == ("", "")
+    assert process.returncode == 0
+
+
+def test_ends_with_its_parent(start: Start) -> None:
+    """When its standard input ends, as it does when the parent dies, the emulator ends as well."""
+    process, _ = start("--profile", "ideal")
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(timeout=5) == 0
+
+
+@pytest.mark.parametrize("options", [[], ["--tcp"]], ids=["pty", "tcp"])
+def test_both_devices_answer_again_and_again(start: Start, options: list[str]) -> None:
+    """Each device answers HELLO, and answers the next host after the first has gone."""
+    _, facts = start("--profile", "tvg43", "--seed", "7", *options)
+    for name, kind, model in (("gyro", 1, b"tvg43"), ("stage", 2, b"stage2")):
+        for session in (1, 2):
+            with opened(facts[name]) as port:
+                port.send(hello(session))
+                identity = port.wait_for(IDENTITY)
+                while int.from_bytes(identity[7:11], "little") != session:
+                    identity = port.wait_for(IDENTITY)
+                assert identity[11] == kind
+                assert identity[24:40].rstrip(b"\0") == model
+
+
+def test_one_host_at_a_time_over_tcp(start: Start) -> None:
+    """A second host at the same TCP port is turned away; the first goes on; once it has gone another may come."""
+    _, facts = start("--profile", "ideal", "--tcp", "--only", "gyro")
+    assert "stage" not in facts
+    assert facts["gyro"].startswith("native:socket://127.0.0.1:")
+    with opened(facts["gyro"]) as first:
+        first.send(hello())
+        first.wait_for(IDENTITY)
+        with opened(facts["gyro"]) as second, pytest.raises(EOFError):
+            second.receive()
+        first.send(hello(2))
+        assert first.wait_for(IDENTITY)[7] == 2
+    deadline = time.monotonic() + 5
+    while True:  # until the emulator has seen the first one go
+        with opened(facts["gyro"]) as third, contextlib.suppress(EOFError):
+            third.send(hello(3))
+            assert third.wait_for(IDENTITY)[7] == 3
+            return
+        assert time.monotonic() < deadline
+
+
+def follow(gyro: RawPort, stage: RawPort | None, *, until: Callable[[bytes], bool]) -> list[bytes]:
+    """Acknowledge everything on both lines until a body says that it is enough; return all bodies."""
+    ports = [port for port in (gyro, stage) if port is not None]
+    bodies: list[bytes] = []
+    while True:
+        ready = select.select([port.handle for port in ports], [], [], 5.0)[0]
+        assert ready, "the emulator has fallen silent"
+        for port in ports:
+            if port.handle not in ready:
+                continue
+            for body in port.receive():
+                bodies.append(body)
+                if body[0] == SAMPLES:
+                    port.send(heartbeat(parse_samples(body).time_us))
+                elif body[0] == STAGE_STATUS:
+                    port.send(heartbeat(parse_status(body).time_us))
+                if until(body):
+                    return bodies
+
+
+def homed(body: bytes) -> bool:
+    """Return whether this is the status of a stage at rest after homing."""
+    return body[0] == STAGE_STATUS and parse_status(body).state == IDLE
+
+
+def test_full_speed_is_a_lockstep(start: Start) -> None:
+    """As fast as the host reads: 100 s of data in far less, nothing lost, the same again from the same seed."""
+
+    def run() -> tuple[list[int], float]:
+        _, facts = start("--seed", "3", "--speed", "max")
+        with opened(facts["gyro"]) as gyro, opened(facts["stage"]) as stage:
+            gyro.send(hello())
+            stage.send(hello())
+            stage.send(request(HOME, 1))
+            follow(gyro, stage, until=homed)
+            begin = time.monotonic()
+            gyro.send(request(STREAM_START, 1))
+            done = 100 * 235
+
+            def enough(body: bytes) -> bool:
+                return body[0] == SAMPLES and parse_samples(body).index >= done
+
+            bodies = follow(gyro, stage, until=enough)
+            wall = time.monotonic() - begin
+        blocks = [parse_samples(body) for body in bodies if body[0] == SAMPLES]
+        assert [block.index for block in blocks] == list(range(0, 47 * len(blocks), 47))
+        assert blocks[-1].n_overruns == 0
+        return [count for block in blocks for count in block.counts], wall
+
+    counts, wall = run()
+    assert wall < 10.0  # 0.3 s on a quiet machine
+    assert run()[0] == counts
+
+
+def test_full_speed_waits_for_the_host(start: Start) -> None:
+    """A host that does not acknowledge gets one block ahead at once and the next ones in real time only."""
+    _, facts = start("--speed", "max", "--only", "gyro")
+    with opened(facts["gyro"]) as gyro:
+        gyro.send(hello())
+        gyro.wait_for(IDENTITY)
+        gyro.send(request(STREAM_START, 1))
+        while parse_samples(gyro.wait_for(SAMPLES)).time_us < 100_000:
+            pass  # so early that a host need not acknowledge yet
+        begin = time.monotonic()
+        for _ in range(3):
+            gyro.wait_for(SAMPLES)
+        assert 0.5 < time.monotonic() - begin < 3.0  # three blocks of 0.2 s
+
+
+def test_self_test_at_full_speed_takes_no_time(start: Start) -> None:
+    """At full speed the wait for a self-test's end is skipped."""
+    _, facts = start("--speed", "max", "--only", "gyro")
+    with opened(facts["gyro"]) as gyro:
+        gyro.send(hello())
+        identity = gyro.wait_for(IDENTITY)
+        assert int.from_bytes(identity[16:24], "little") < 5_000_000  # without a host time is real time
+        begin = time.monotonic()
+        gyro.send(request(SELF_TEST, 1))
+        gyro.wait_for(0x85)
+        assert time.monotonic() - begin < 0.45  # of 0.5 s
+
+
+def test_real_time_is_real_time(start: Start) -> None:
+    """At 1x a second of data takes a second, acknowledged or not."""
+    _, facts = start("--profile", "ideal", "--only", "gyro")
+    with opened(facts["gyro"]) as gyro:
+        gyro.send(hello())
+        gyro.send(request(STREAM_START, 1))
+        first = parse_samples(gyro.wait_for(SAMPLES))
+        begin = time.monotonic()
+        for _ in range(5):
+            last = parse_samples(gyro.wait_for(SAMPLES))
+        wall = time.monotonic() - begin
+    assert (last.time_us - first.time_us) * 1e-6 == pytest.approx(1.0, abs=1e-5)
+    assert wall == pytest.approx(1.0, abs=0.3)
+
+
+def test_ten_times_real_time(start: Start) -> None:
+    """At 10x ten seconds of data take one."""
+    _, facts = start("--profile", "ideal", "--only", "gyro", "--speed", "10")
+    with opened(facts["gyro"]) as gyro:
+        gyro.send(hello())
+        gyro.send(request(STREAM_START, 1))
+        begin = time.monotonic()
+        follow(gyro, None, until=lambda body: body[0] == SAMPLES and parse_samples(body).time_us > 10_500_000)
+        assert 0.8 < time.monotonic() - begin < 3.0
+
+
+@pytest.mark.parametrize("speed", ["20", "max"])
+def test_killed_host_stops_the_stage(start: Start, speed: str) -> None:
+    """The host is killed while the stage moves: within 300 ms its watchdog brings it to rest."""
+    _, facts = start("--profile", "ideal", "--speed", speed)
+    command = [sys.executable, str(ROOT / "tests" / "raw_host.py"), facts["stage"]]
+    with opened(facts["stage"]) as observer, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as host:
+        assert host.stdout is not None
+        lines: list[str] = []
+        while sum(line.startswith(f"{MOVING} ") for line in lines) < 10:
+            lines.append(host.stdout.readline())
+        host.kill()
+        killed = time.monotonic()
+        acknowledged_us = max(int(line.split()[1]) for line in [*lines, *host.stdout])
+        fault = None
+        while fault is None:
+            found = [parse_status(body) for body in observer.receive() if body[0] == STAGE_STATUS]
+            fault = next((status for status in found if status.state == FAULT), None)
+        assert time.monotonic() - killed < 1.0  # 0.35 s on a quiet machine
+    assert fault.fault == 1
+    # 300 ms after a heartbeat, which may have been sent up to one status later than what it acknowledged
+    assert 0 < fault.time_us - acknowledged_us <= 420_000
+
+
+def test_unplugged_line_hangs_up(start: Start) -> None:
+    """A line unplugged by a fault is gone for the host, and the other goes on."""
+    _, facts = start("--profile", "ideal", "--fault", "gyro:unplug@0.5")
+    with opened(facts["gyro"]) as gyro, opened(facts["stage"]) as stage:
+        gyro.send(hello())
+        gyro.wait_for(IDENTITY)
+        with pytest.raises(EOFError):
+            gyro.wait_for(SAMPLES)
+        stage.send(hello())
+        stage.wait_for(IDENTITY)
+
+
+def test_full_line_drops_blocks_as_a_uart_would(start: Start) -> None:
+    """A host that does not read loses blocks, is told so, and finds no block damaged."""
+    _, facts = start("--profile", "fast3", "--only", "gyro")
+    with opened(facts["gyro"]) as gyro:
+        gyro.send(hello())
+        gyro.send(request(STREAM_START, 1))
+        begin = time.monotonic()
+        blocked = select.select([], [], [], 2.5)  # 60 kB of samples, more than the line and the device hold
+        assert blocked == ([], [], [])
+        blocks: list[Samples] = []
+        while not blocks or blocks[-1].n_overruns == 0:
+            blocks += [parse_samples(body) for body in gyro.receive() if body[0] == SAMPLES]
+            assert time.monotonic() - begin < 10
+        assert gyro.n_damaged == 0
+        assert blocks[-1].status & 16
+        n_missing = sum(b.index - a.index - len(a.counts) // 3 for a, b in itertools.pairwise(blocks))
+        assert n_missing == blocks[-1].n_overruns
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--profile", "tvg44"], "no profile 'tvg44'"),
+        (["--latitude", "91"], "latitude must be from -90 to 90 deg, got 91"),
+        (["--speed", "0.5"], "speed must be at least 1, got 0.5"),
+        (["--seed", "-1"], "seed must not be negative"),
+        (["--fault", "gyro:explode@1"], "the gyro has no fault 'explode'"),
+    ],
+)
+def test_wrong_options(options: list[str], message: str) -> None:
+    """Options that make no sense end it at once with one line and exit code 2."""
+    command = [sys.executable, "-m", "sim_device", *options]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_pace_without_hosts() -> None:
+    """Without hosts time runs at real time, or at the speed asked for, however long the emulator was not looked at."""
+    for speed, expected in [(1.0, 3_000_000), (5.0, 15_000_000), (math.inf, 3_000_000)]:
+        bench = SimBench("ideal")
+        pace = Pace(bench, speed)
+        for wall_us in (10, 1_000_000, 1_000_001, 3_000_000):
+            pace.advance(wall_us)
+            assert not pace.run_ahead()
+        assert bench.now_us == expected
+
+
+def test_pace_with_a_host_that_dies() -> None:
+    """Once its host is silent the world waits for 50 ms, then goes on at real time."""
+    bench = SimBench("ideal")
+    bench.stage.feed(hello(), 0)
+    pace = Pace(bench, math.inf)
+    pace.advance(0)
+    while pace.run_ahead():
+        pass
+    ahead = bench.now_us
+    pace.advance(PATIENCE_US)
+    assert bench.now_us == ahead
+    pace.advance(PATIENCE_US + 5_000_000)
+    assert bench.now_us == ahead + 5_000_000
+    assert not pace.run_ahead()
