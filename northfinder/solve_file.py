@@ -16,12 +16,14 @@ from northfinder.record import Record
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, fix_to_json, solve
 from northfinder.table_report import dwell_table_json, triad_json
-from northfinder.tables import DwellTable, StaticTriad, read_table
+from northfinder.tables import DwellTable, StaticTriad, read_table, stated_input_axis_offset
 
 _SQLITE = b"SQLite format 3\0"
 
 
-def solve_file(path: Path, assumptions: Assumptions | None, *, input_axis_offset: float = 0.0) -> dict[str, Any]:
+def solve_file(
+    path: Path, assumptions: Assumptions | None, *, input_axis_offset: float | None = None
+) -> dict[str, Any]:
     """Return the fix from a file of any kind.
 
     Parameters
@@ -30,8 +32,9 @@ def solve_file(path: Path, assumptions: Assumptions | None, *, input_axis_offset
         Told apart by its content, not by its name.
     assumptions : Assumptions, optional
         In place of those kept in a record; for a table, its latitude is used.
-    input_axis_offset : float
-        For a table of dwells: where the input axis points at stage azimuth zero, rad.
+    input_axis_offset : float, optional
+        For a table of dwells: where the input axis points at stage azimuth zero, rad. If not given, what the file
+        states, or zero.
 
     Raises
     ------
@@ -70,12 +73,15 @@ def _kept_assumptions(record: Record) -> Assumptions:
         raise RecordError(f"the record {record.path} is damaged: its assumptions cannot be read: {error}") from None
 
 
-def _solve_table(table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float) -> dict[str, Any]:
+def _solve_table(
+    table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float | None
+) -> dict[str, Any]:
     if isinstance(table, StaticTriad):
         means = [static_mean(position.name, position.rate, position.specific_force) for position in table.positions]
         return triad_json(solve_triad(means, latitude=latitude))
-    return dwell_table_json(
-        solve_dwell_table(
-            table.azimuth, table.elevation, table.rate, input_axis_offset=input_axis_offset, latitude=latitude
-        )
+    if input_axis_offset is None:
+        input_axis_offset = stated_input_axis_offset(table.metadata) or 0.0
+    fix = solve_dwell_table(
+        table.azimuth, table.elevation, table.rate, input_axis_offset=input_axis_offset, latitude=latitude
     )
+    return dwell_table_json(fix) | {"input_axis_offset_deg": math.degrees(input_axis_offset)}

@@ -14,7 +14,8 @@ static triad            ``gyro_x_*``, ``gyro_y_*``, ``gyro_z_*``            ``dp
                         ``position``, if there: names the position
 ======================  ==================================================  ==========================================
 
-Rows are in the order of time. ``# key: value`` lines are offered as metadata and never used unasked.
+Rows are in the order of time. ``# key: value`` lines are offered as metadata. Of them only one thing is used unasked:
+"points at stage_azimuth_deg + 180" says where the input axis stands on the stage, and the result repeats it.
 """
 
 from __future__ import annotations
@@ -54,6 +55,16 @@ def stated_latitude(metadata: Mapping[str, str]) -> float | None:
     """Return the latitude in rad that a ``# latitude_deg: NUMBER`` line states, None without one."""
     found = re.match(r"[+-]?\d{1,2}(\.\d+)?(?![\d.])", metadata.get("latitude_deg", ""), re.ASCII)
     return math.radians(float(found[0])) if found and abs(float(found[0])) <= 90.0 else None
+
+
+def stated_input_axis_offset(metadata: Mapping[str, str]) -> float | None:
+    """Return the angle in rad of "points at stage_azimuth_deg + ANGLE" in a comment, None without one."""
+    pattern = r"points at stage_azimuth_deg ([+-]) (\d{1,3}(?:\.\d+)?)(?![\d.]*\d)"
+    for value in metadata.values():
+        found = re.search(pattern, value, re.ASCII)
+        if found:
+            return math.radians(float(found[1] + found[2]))
+    return None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

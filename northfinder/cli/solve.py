@@ -23,10 +23,8 @@ from northfinder.text import printable
     "--input-axis-offset",
     "offset_deg",
     type=float,
-    default=0.0,
-    show_default=True,
     metavar="DEG",
-    help="For a table of dwells: where the input axis points at stage azimuth zero.",
+    help="For a table of dwells: where the input axis points at stage azimuth zero, if not as the file says.",
 )
 @estimation_options
 @click.pass_context
@@ -34,7 +32,7 @@ def command(
     context: click.Context,
     *,
     file: Path,
-    offset_deg: float,
+    offset_deg: float | None,
     latitude_deg: float | None,
     profile: str | None,
     g_drift_dph: float | None,
@@ -53,7 +51,8 @@ def command(
     given = {name: context.get_parameter_source(name) for name in ("latitude_deg", "profile", "g_drift_dph", "method")}
     own = all(source is click.core.ParameterSource.DEFAULT for source in given.values())
     assumptions = Assumptions.gather(profile=profile, latitude_deg=latitude_deg, g_drift_dph=g_drift_dph, method=method)
-    result = solve_file(file, None if own else assumptions, input_axis_offset=math.radians(offset_deg))
+    offset = None if offset_deg is None else math.radians(offset_deg)
+    result = solve_file(file, None if own else assumptions, input_axis_offset=offset)
     if as_json:
         print_json(result)
     elif "checks" in result:
