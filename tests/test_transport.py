@@ -14,7 +14,7 @@ import pytest
 from drivers.api import ByteLink, Clock
 from drivers.errors import LinkError
 from drivers.transport.clock import SystemClock
-from drivers.transport.serial_port import SerialLink, list_ports, open_link
+from drivers.transport.serial_port import _MAX_CHUNKS, SerialLink, list_ports, open_link
 from drivers.transport.virtual import VirtualClock, VirtualLink
 
 PATIENCE = 5.0  # s, far more than anything here takes
@@ -170,8 +170,7 @@ def test_an_unread_link_closes(pty: Pty) -> None:
     """A reader whose queue is full still ends when the link is closed."""
     link = open_link(pty.path, SystemClock())
     assert isinstance(link, SerialLink)
-    while not link._chunks.full():
-        link._chunks.put(b"")
+    link._chunks.extend([b"unread"] * _MAX_CHUNKS)
     pty.write(b"more")
     link.close()
     assert not link._reader.is_alive()

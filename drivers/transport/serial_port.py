@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import errno
 import os
-import queue
 import re
 import select
 import socket
 import threading
+import time
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -96,7 +97,7 @@ class SerialLink:
         self._name = address
         self._clock = clock
         self._selectable = _selectable(address)
-        self._chunks: queue.Queue[bytes] = queue.Queue(_MAX_CHUNKS)
+        self._chunks: deque[bytes] = deque()
         self._closed = False
         self._lost = ""
         self._reader = threading.Thread(target=self._read_on, name=f"reader of {address}", daemon=True)
@@ -111,8 +112,11 @@ class SerialLink:
         """Hand over all of `data` for sending; blocks while the port takes no more, for a second at most."""
         self._require_open()
         try:
-            self._port.write(data)
-        except serial.SerialTimeoutException as error:
+            if os.name == "posix":
+                _write_all(self._port.fileno(), data)
+            else:
+                self._port.write(data)
+        except (serial.SerialTimeoutException, TimeoutError) as error:
             raise LinkError(f"{self._name} takes no more bytes: nothing reads at its other end") from error
         except (OSError, ValueError) as error:
             self._lost = self._lost or f"{self._name} was unplugged ({error})"
@@ -120,14 +124,12 @@ class SerialLink:
 
     def receive(self) -> bytes:
         """Return all bytes that have arrived, ``b""`` if none. Never waits."""
-        lost = self._lost  # seen before the queue, or a last chunk could be overlooked
-        chunks = []
-        with suppress(queue.Empty):
-            while True:
-                chunks.append(self._chunks.get_nowait())
-        if not chunks and (lost or self._closed):
-            self._require_open()
-        return b"".join(chunks)
+        lost = self._lost  # seen before the chunks, or the last one could be overlooked
+        if not self._chunks:
+            if lost or self._closed:
+                self._require_open()
+            return b""
+        return b"".join(self._chunks.popleft() for _ in range(len(self._chunks)))
 
     def close(self) -> None:
         """Release the port. Closing twice is no error."""
@@ -135,6 +137,7 @@ class SerialLink:
             return
         self._closed = True
         self._reader.join(1.0)
+        self._chunks.clear()
         with suppress(OSError, ValueError):
             self._port.close()
 
@@ -147,8 +150,10 @@ class SerialLink:
     def _read_on(self) -> None:
         try:
             while not self._closed:
-                if data := self._read_some():
-                    self._put(data)
+                if len(self._chunks) >= _MAX_CHUNKS:
+                    time.sleep(_POLL)
+                elif data := self._read_some():
+                    self._chunks.append(data)
                     self._clock.notify()
         except (OSError, ValueError) as error:
             self._lost = f"{self._name} was unplugged ({error})"
@@ -161,14 +166,31 @@ class SerialLink:
             size = _CHUNK if ready else 0
         else:
             size = min(_CHUNK, max(1, self._port.in_waiting))
-        data: bytes = self._port.read(size) if size else b""
+        if not size:
+            return b""
+        if os.name != "posix":
+            data: bytes = self._port.read(size)
+            return data
+        data = os.read(self._port.fileno(), size)
+        if not data:
+            raise ConnectionError("the other end is gone")
         return data
 
-    def _put(self, data: bytes) -> None:
-        while not self._closed:
-            with suppress(queue.Full):
-                self._chunks.put(data, timeout=_POLL)
-                return
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    """Write to a descriptor that does not block; pyserial's own write makes a second system call each time.
+
+    Raises
+    ------
+    TimeoutError
+        If it takes nothing for `_WRITE_TIMEOUT`.
+    """
+    while data:
+        try:
+            data = data[os.write(descriptor, data) :]
+        except BlockingIOError:
+            if not select.select([], [descriptor], [], _WRITE_TIMEOUT)[1]:
+                raise TimeoutError from None
 
 
 def _selectable(address: str) -> bool:
