@@ -46,6 +46,15 @@ def test_scale_factors_per_plane_and_their_ratio() -> None:
     assert math.degrees(elsewhere.latitude) - 30.0 == pytest.approx(2.6, abs=0.2)  # k of one latitude, at another
 
 
+def test_later_visits_of_a_position_do_not_count() -> None:
+    """The repeated U1 hold the drift: whatever they read, the published formulas do not see it."""
+    means = make_means(130.0, 50.0)
+    rate = means.rate[:, 0].copy()
+    rate[[4, 7]] += 5.0 * DPH
+    first, disturbed = solve_closed_form(means), solve_closed_form(means.with_rate(rate))
+    assert (disturbed.azimuth, disturbed.latitude) == (first.azimuth, first.latitude)
+
+
 def test_no_scale_factor_where_the_earth_is_not_felt() -> None:
     """On the equator the vertical scale factor has no value, and is not infinite."""
     result = solve_closed_form(make_means(10.0, 0.0), known_latitude=0.0)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from simulated_means import DPH, OMEGA_DPH, SIX, TVG43, U1, U2, U3, U4, U5, U6, draw_noise, make_means
 
 from northfinder.errors import EstimateError
@@ -175,6 +176,22 @@ def test_a_known_latitude_stands_in_for_the_missing_vertical() -> None:
     assert math.degrees(blind.azimuth_sd) > 0.5  # the vertical rate may be anything, and the pedestal leans
 
 
+def test_small_elevations_measure_the_vertical_as_well_as_they_can() -> None:
+    """Elevations of a degree give a rough latitude and hardly spoil the azimuth; of an arc minute, no latitude."""
+    signs = (1, -1, -1, 1, 1, 1, -1, -1)
+    fixes = []
+    for size in (1.0, 1.0 / 60.0):
+        uneven = tuple((azimuth, size * sign) for (azimuth, _), sign in zip(FOUR * 2, signs, strict=True))
+        fixes.append(estimate(make_means(111.0, 60.0, positions=uneven), noise=NOISE))
+    level = estimate(make_means(111.0, 60.0, positions=FOUR * 2), noise=NOISE)
+    assert latitude_deg(fixes[0]) == pytest.approx(60.0, abs=1e-6)
+    assert fixes[0].latitude_sd is not None
+    assert math.degrees(fixes[0].latitude_sd) > 1.0
+    assert fixes[0].azimuth_sd < 1.5 * level.azimuth_sd
+    assert fixes[1].latitude is None
+    assert abs(azimuth_error_deg(fixes[1], 111.0)) < 3.0 * math.degrees(fixes[1].azimuth_sd)
+
+
 def test_what_is_known_narrows_what_is_not() -> None:
     """A known scale factor improves the latitude, a known latitude the scale factor, and each by its own sd."""
     means = make_means(70.0, -40.0)
@@ -217,6 +234,27 @@ def test_three_axes_share_one_earth() -> None:
     assert azimuth_error_deg(fix, 200.0) == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(np.array(fix.bias[:2]) / DPH, [38.0, -5.0], atol=1e-6)
     assert fix.residuals.shape == (3, 3)
+
+
+def test_three_axes_agree_with_an_attitude_from_two_vectors() -> None:
+    """The earth rate and the vertical seen in the head's axes, aligned with the true ones, give the same azimuth."""
+    azimuth, elevation = np.radians([20.0, 200.0, 110.0]), np.radians([10.0, -15.0, 40.0])
+    truth = OMEGA_DPH * DPH * np.array([math.cos(1.0), 0.0, -math.sin(1.0)])
+    head_to_north = Rotation.from_euler("ZY", np.column_stack([azimuth + 2.5, elevation]))
+    means = RateMeans(
+        start=[0.0, 20.0, 40.0],
+        duration=[10.0] * 3,
+        rate=head_to_north.inv().apply(truth) + np.array([1.0, 2.0, -3.0]) * DPH,
+        azimuth=azimuth,
+        elevation=elevation,
+    )
+    fix = estimate(means, noise=NOISE, weights="generalised")
+    seen = [(means.rate[0] - np.array(fix.bias)) / np.linalg.norm(truth), head_to_north[0].inv().apply([0.0, 0.0, 1.0])]
+    attitude, _ = Rotation.align_vectors([truth / np.linalg.norm(truth), [0.0, 0.0, 1.0]], seen)
+    forward = attitude.apply([1.0, 0.0, 0.0])
+    assert fix.azimuth == pytest.approx(math.atan2(forward[1], forward[0]) - azimuth[0], abs=1e-9)
+    assert fix.azimuth == pytest.approx(2.5, abs=1e-9)
+    assert fix.latitude == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,8 @@ Weights = Literal["ordinary", "generalised"]
 
 #: Residuals that a right noise model reaches less often than this put a factor on the standard deviations.
 RESCALE_BELOW = 0.02
+#: Positions whose elevations spread by this sine or more are there to measure the vertical earth rate.
+MEASURES_VERTICAL = 0.05
 #: The scale factor is taken to lie this near 1 where it is not known and the earth's vertical rate must be assumed.
 _SCALE_FACTOR_SD = 0.1
 _NO_VERTICAL = "no position turns the input axis up or down, so the vertical earth rate was not measured"
@@ -86,8 +88,7 @@ def estimate(
     if weights == "generalised" and noise is None:
         raise ValueError("generalised weights need a noise model")
     design = build_design(means, drift)
-    vertical = design.vertical
-    fit = _fit(design, noise, weights, vertical=None if vertical else _assumed_vertical(known))
+    fit, vertical = _fit_best(design, noise, weights, known)
     nev, cov = _earth_rates(fit, known)
     horizontal = require_horizontal(nev, cov)
     constrained = constrain(nev, cov, known) if vertical else horizontal_only(nev, cov, known)
@@ -127,6 +128,19 @@ class _Fit:
     sd_dof: float
     rescaled_by: float
     tests: tuple[tuple[str, float, int], ...] = ()  # of the noise model: name, chi2 and dof of the residuals
+
+
+def _fit_best(design: Design, noise: NoiseModel | None, weights: Weights, known: Known) -> tuple[_Fit, bool]:
+    """Return the fit, and whether V is measured: by design, or in spite of it better than it can be assumed."""
+    if design.vertical >= MEASURES_VERTICAL:
+        return _fit(design, noise, weights, None), True
+    assumed = _assumed_vertical(known)
+    rows, columns = design.matrix.shape
+    if design.vertical > 0.0 and (noise is not None or rows > columns):
+        measured = _fit(design, noise, weights, None)
+        if math.sqrt(measured.covariance[2, 2]) < assumed[1]:
+            return measured, True
+    return _fit(design, noise, weights, assumed), False
 
 
 def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: tuple[float, float] | None) -> _Fit:

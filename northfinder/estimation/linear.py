@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 Drift = Literal["constant", "linear", "pairs"]
 
 #: A quantity whose column of the design, the other columns taken out, keeps less than this part is not determined.
-#: For V it is a sine of elevation: data within 3 deg of horizontal do not measure it.
-NOT_DETERMINED = {"N": 0.01, "E": 0.01, "V": 0.05, "bias": 1e-6}
+NOT_DETERMINED = {"N": 0.01, "E": 0.01, "V": 1e-6, "bias": 1e-6}
 _REASON = {
     "N": "the part of the earth rate along stage azimuth 0 deg: measure at two azimuths about 180 deg apart near it",
     "E": "the part of the earth rate along stage azimuth 90 deg: measure at two azimuths about 180 deg apart near it",
@@ -38,7 +37,7 @@ class Design:
     sensitivity: Array  #: (n, n_axes, 3)
     bias: Array  #: (n, n_bias), the same for each axis
     drift: Drift
-    vertical: bool  #: whether the positions measure V
+    vertical: float  #: part of the column of V that the other columns leave: a sine of elevation
 
     @property
     def matrix(self) -> Array:
@@ -94,12 +93,12 @@ def half_span(means: RateMeans) -> float:
     return float(means.start[-1] + means.duration[-1] - means.start[0]) / 2.0
 
 
-def _check_determined(matrix: Array) -> bool:
-    """Return whether the positions measure V. Raises EstimateError naming anything else that they do not."""
+def _check_determined(matrix: Array) -> float:
+    """Return how well the positions measure V, 0 if not. Raises EstimateError naming anything else that they do not."""
     kept, names = _kept(matrix), ["N", "E", "V"]
-    vertical = bool(kept[2] >= NOT_DETERMINED["V"])
-    if not vertical:
-        kept, names = _kept(np.delete(matrix, 2, axis=1)), ["N", "E"]
+    vertical = float(kept[2])
+    if vertical < NOT_DETERMINED["V"]:
+        vertical, kept, names = 0.0, _kept(np.delete(matrix, 2, axis=1)), ["N", "E"]
     if matrix.shape[0] < kept.size:
         what = f"{matrix.shape[0]} means cannot determine {kept.size} unknowns"
         raise EstimateError(f"{what}: measure at more positions, or take a simpler drift")
