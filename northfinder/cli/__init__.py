@@ -21,6 +21,7 @@ EXIT_INTERRUPTED = 130
 _COMMANDS = {
     "find": "Measure the true azimuth and the latitude.",
     "solve": "Estimate again from a record, or from a table of measurements.",
+    "allan": "Identify a gyro's noise from a recording at rest.",
     "emulate": "Serve an emulated gyro and stage.",
     "devices": "List the ports and identify what answers.",
 }
@@ -63,14 +64,14 @@ def cli() -> None:
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
 
 
-def main() -> NoReturn:
-    """Run the command line and leave with its exit code; every declared failure is one line."""
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command line, by default the process's own, and leave with its exit code; every failure is one line."""
     from drivers.errors import DeviceError  # noqa: PLC0415  # keeps --help quick
     from northfinder.errors import NorthFinderError  # noqa: PLC0415
     from northfinder.text import printable  # noqa: PLC0415
 
     try:
-        code = cli.main(standalone_mode=False)
+        code = cli.main(arguments, standalone_mode=False)
     except click.exceptions.Abort:
         code = EXIT_INTERRUPTED
     except click.ClickException as error:
