@@ -3,8 +3,8 @@
 At 1x world time is wall time. Faster, the world never runs slower than that, and runs ahead only while the host keeps
 up: it goes from one thing that is due to the next, and holds as soon as a device has sent a stream frame that its host
 must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. So a run at full speed is a lockstep with the host. When
-the host stays away for `PATIENCE_US` of wall time, time goes on at 1x from there: a dead host trips the stage's
-watchdog as it would in reality.
+the host stays away, time goes on at 1x from there: soon while the stage moves, so that a dead host trips its watchdog
+as it would in reality; later at rest, so that a host which is merely busy finds the same world again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import math
 
 from sim_device.bench import Line, SimBench
 
-PATIENCE_US = 50_000  #: wall time for which the world waits for the host
+MOVING_PATIENCE_US = 50_000  #: wall time for which the world waits for the host while the stage moves
+REST_PATIENCE_US = 250_000  #: the same with the stage at rest
 HEARTBEAT_US = 100_000  #: a host acknowledges once it has seen so much device time
 MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
@@ -38,7 +39,8 @@ class Pace:
         self._bench = bench
         self._speed = speed
         self._wall_us = 0
-        self._lead_us = 0  # the most by which the world has been ahead of wall time
+        self._lead_us = 0  # the most by which the world has been ahead of wall time since the stage moves or rests
+        self._in_motion = False
         self._limit_us = 0.0  # of the world, by the speed
 
     def advance(self, wall_us: int) -> None:
@@ -46,6 +48,9 @@ class Pace:
         bench = self._bench
         passed_us, self._wall_us = wall_us - self._wall_us, wall_us
         self._limit_us = bench.now_us + self._speed * passed_us
+        if self._in_motion != self._moves():
+            self._in_motion = not self._in_motion
+            self._lead_us = bench.now_us - (wall_us - passed_us)
         if self._speed > 1 and not self._with_host():
             bench.advance_to(bench.now_us + passed_us if self._speed == math.inf else round(self._limit_us))
         else:
@@ -77,7 +82,12 @@ class Pace:
 
     def _steady_us(self) -> int:
         """Return where the world is at least, hosts or not."""
-        return self._wall_us if self._speed == 1 else self._wall_us + self._lead_us - PATIENCE_US
+        if self._speed == 1:
+            return self._wall_us
+        return self._wall_us + self._lead_us - (MOVING_PATIENCE_US if self._in_motion else REST_PATIENCE_US)
+
+    def _moves(self) -> bool:
+        return self._bench.now_us <= self._bench.plant_stage.rest_since_us() + CONTROL_US
 
     def _next_us(self) -> int | None:
         """Return what the world may run ahead to, None if it has to wait."""
@@ -95,5 +105,4 @@ class Pace:
             return -math.inf if awaited else math.inf
         if line.spoke_us >= seen_us + HEARTBEAT_US:
             return -math.inf
-        in_motion = self._bench.now_us <= self._bench.plant_stage.rest_since_us() + CONTROL_US
-        return line.epoch_us + seen_us + (MOVING_WINDOW_US if in_motion else REST_WINDOW_US)
+        return line.epoch_us + seen_us + (MOVING_WINDOW_US if self._moves() else REST_WINDOW_US)
