@@ -319,6 +319,7 @@ def test_improbable_residuals_widen_the_errors_and_are_reported() -> None:
     assert wrong.rescaled_by == pytest.approx(2.0, rel=0.15)
     assert wrong.azimuth_sd == pytest.approx(right.azimuth_sd, rel=0.15)
     assert failed(wrong) == ["residuals"]
+    assert wrong.trustworthy  # the wider interval holds
     double = NoiseModel.from_field_units(**{name: value * 2.0 for name, value in TVG43.items()})
     assert failed(estimate(means, noise=double, weights="generalised")) == ["residuals"]
 
@@ -346,7 +347,9 @@ def test_a_wrong_entry_is_contradicted_by_the_data() -> None:
     right = Known(latitude=math.radians(50.0), scale_factor=1.0)
     assert failed(estimate(means, noise=NOISE, known=right)) == []
     for wrong in (replace(right, latitude=math.radians(52.0)), replace(right, scale_factor=1.05)):
-        names = failed(estimate(means, noise=NOISE, known=wrong))
+        fix = estimate(means, noise=NOISE, known=wrong)
+        names = failed(fix)
+        assert not fix.trustworthy
         assert names == (["latitude"] if wrong.latitude != right.latitude else ["scale factor"])
 
 
