@@ -1,6 +1,7 @@
 """What a bench is made of: gyro and stage with their errors, read from a TOML file in field units.
 
 Profiles that come with the emulator lie beside this module in ``profiles``; a path to a file of one's own does as well.
+A file of a gyro's noise alone, as ``northfinder allan`` saves it, makes a gyro with that noise on the bench of tvg43.
 Every key is checked: an unknown one, a wrong type or a value out of range is a ValueError that names key and file.
 """
 
@@ -113,6 +114,17 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     stage: StageProfile
 
 
+class IdentifiedProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the instrument knows of a gyro; standard deviations are its own business and are not used."""
+
+    name: str
+    noise: NoiseProfile
+    acceleration_sensitive_drift_rate_dph_per_g: float = 0.0
+    acceleration_sensitive_drift_rate_sd_dph_per_g: NotNegative = 0.0
+    scale_factor: Positive | None = None
+    scale_factor_sd: NotNegative = 0.0
+
+
 def profile_names() -> list[str]:
     """Return the names of the profiles that come with the emulator."""
     folder = resources.files(__package__) / "profiles"
@@ -144,7 +156,10 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 def _parse(text: str, origin: str, folder: Path) -> Profile:
     try:
-        profile = msgspec.convert(tomllib.loads(text), Profile)
+        table = tomllib.loads(text)
+        if "noise" in table and "gyro" not in table:
+            return _on_tvg43_bench(msgspec.convert(table, IdentifiedProfile))
+        profile = msgspec.convert(table, Profile)
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
         raise ValueError(f"{origin}: {str(error).replace('Object contains unknown field', 'unknown key')}") from error
     recording = profile.gyro.recording
@@ -152,3 +167,16 @@ def _parse(text: str, origin: str, folder: Path) -> Profile:
         return profile
     found = msgspec.structs.replace(recording, file=str(folder / recording.file))
     return msgspec.structs.replace(profile, gyro=msgspec.structs.replace(profile.gyro, recording=found))
+
+
+def _on_tvg43_bench(identified: IdentifiedProfile) -> Profile:
+    """Return the bench of tvg43 with a gyro whose identified errors take the place of its own."""
+    bench = load_profile("tvg43")
+    gyro = msgspec.structs.replace(
+        bench.gyro,
+        model="identified",
+        noise=identified.noise,
+        acceleration_sensitive_drift_rate_dph_per_g=identified.acceleration_sensitive_drift_rate_dph_per_g,
+        scale_factor_error=0.0 if identified.scale_factor is None else identified.scale_factor - 1.0,
+    )
+    return msgspec.structs.replace(bench, name=identified.name, description="", gyro=gyro)
