@@ -344,6 +344,7 @@ class Sequencer:
         gyro = self._devices()[0]
         while True:
             self._check_stop()
+            before = self._state
             state = self._service_stage()
             if state.mode is StageMode.FAULT:
                 raise DeviceFaultError(f"the stage reports {state.fault}; it stays stopped until the fault is cleared")
@@ -357,7 +358,7 @@ class Sequencer:
                 self._report(blocks[-1], first=first, stop=stop)
             if done():
                 return
-            if not blocks:
+            if not blocks and state is before:  # else look again first: the devices wait for word of what has come
                 self.clock.wait(self.clock.now() + SERVICE_PERIOD)
 
     def _serve_until_index(self, index: int) -> None:

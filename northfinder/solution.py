@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from northfinder.errors import ConfigError
 from northfinder.estimation import Check, Fix, Known, NoiseModel, RateMeans, estimate
+from northfinder.estimation.disturbance import undisturbed
 from northfinder.profile import GyroProfile, find_profile
 from northfinder.units import DPH
 
@@ -66,7 +67,9 @@ def solve(means: RateMeans, assumptions: Assumptions) -> Fix:
     """
     noise, known = assumptions.noise(), assumptions.known()
     if assumptions.method == "generalised" and noise is not None:
-        return estimate(means, noise=noise, known=known, weights="generalised")
+        keep = undisturbed(means)
+        n_rejected = means.n - int(keep.sum())
+        return estimate(means.select(keep), noise=noise, known=known, weights="generalised", n_rejected=n_rejected)
     drift: Literal["constant", "linear"] = "linear" if noise is None else "constant"
     return estimate(means.per_dwell(), noise=noise, known=known, drift=drift)
 
@@ -82,6 +85,9 @@ def fix_to_json(fix: Fix) -> dict[str, Any]:
         "bias_dph": fix.bias[0] / DPH if len(fix.bias) == 1 else [bias / DPH for bias in fix.bias],
         "scale_factor": fix.scale_factor,
         "scale_factor_sd": fix.scale_factor_sd,
+        "n_rejected": fix.n_rejected,
+        "normalised_residual": fix.normalised_residual,
+        "rescaled_by": fix.rescaled_by,
         "trustworthy": fix.trustworthy,
         "checks": [_check_to_json(check) for check in fix.checks],
     }
@@ -94,4 +100,11 @@ def _degrees(angle: float | None) -> float | None:
 def _check_to_json(check: Check) -> dict[str, object]:
     factor, unit = {"rad/s": (1 / DPH, "deg/h"), "rad": (math.degrees(1.0), "deg")}.get(check.unit, (1.0, ""))
     figures = {name: getattr(check, name) * factor for name in ("value", "sd", "limit")}
-    return {"name": check.name, "passed": check.passed, **figures, "unit": unit, "sentence": check.sentence}
+    return {
+        "name": check.name,
+        "passed": check.passed,
+        "decisive": check.decisive,
+        **figures,
+        "unit": unit,
+        "sentence": check.sentence,
+    }

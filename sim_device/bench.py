@@ -57,7 +57,6 @@ class Line:
         self.device = device
         self.epoch_us = 0  #: world time of the device's start
         self.room: int | None = None  #: bytes that the line can take now, None for any number; beyond, blocks are lost
-        self.spoke_us = -1  #: when the device last sent something, by its own clock
         self.due_us = device.next_due_us()  #: when the device will next do something, in world time; None if never
         self._out = bytearray()
 
@@ -81,6 +80,11 @@ class Line:
         """Return when the device will next do something, or now if it has sent already."""
         return self.bench.now_us if self._out else self.due_us
 
+    @property
+    def told_us(self) -> int:
+        """Device time of the newest status frame of a stage, -1 if there is none."""
+        return self.device.told_time_us if isinstance(self.device, StageDevice) else -1
+
     def serve(self) -> None:
         """Let the device do what is due now."""
         now_us = self.bench.now_us - self.epoch_us
@@ -90,14 +94,12 @@ class Line:
             sent = self.device.poll(now_us)
         if sent:
             self._out += sent
-            self.spoke_us = now_us
         self._note_due()
 
     def restart(self, device: Device) -> None:
         """Go on with a device that has just started; what the old one had not yet sent is lost."""
         self.device = device
         self.epoch_us = self.bench.now_us
-        self.spoke_us = -1
         self._out.clear()
         self._note_due()
 

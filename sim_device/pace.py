@@ -15,7 +15,6 @@ from sim_device.bench import Line, SimBench
 
 MOVING_PATIENCE_US = 50_000  #: wall time for which the world waits for the host while the stage moves
 REST_PATIENCE_US = 250_000  #: the same with the stage at rest
-HEARTBEAT_US = 100_000  #: a host acknowledges once it has seen so much device time
 MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
 CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
@@ -101,8 +100,8 @@ class Pace:
         """Return up to when a line's host lets the world run ahead."""
         seen_us = line.device.seen_time_us
         if line is self._bench.gyro:
-            awaited = self._bench.gyro_board.newest_block_us >= seen_us + HEARTBEAT_US
+            awaited = self._bench.gyro_board.newest_block_us > seen_us
             return -math.inf if awaited else math.inf
-        if line.spoke_us >= seen_us + HEARTBEAT_US:
+        if line.told_us > seen_us:
             return -math.inf
         return line.epoch_us + seen_us + (MOVING_WINDOW_US if self._moves() else REST_WINDOW_US)

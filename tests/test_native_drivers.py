@@ -80,9 +80,12 @@ class Bench:
     def serve(self, done: Callable[[StageState], bool], *, timeout: float = 120.0) -> StageState:
         """Serve the stage until `done`."""
         deadline = self.clock.now() + timeout
+        before = None
         while not done(state := self.stage.state()):
             assert self.clock.now() < deadline, f"still {state}"
-            self.clock.wait(self.clock.now() + 0.05)
+            if state is before:  # look again before waiting: the next call acknowledges what this one has brought
+                self.clock.wait(self.clock.now() + 0.05)
+            before = state
         return state
 
     def homed(self) -> Bench:
@@ -98,7 +101,8 @@ class Bench:
         blocks = self.gyro.read()
         while self.clock.now() < end:
             self.clock.wait(min(end, self.clock.now() + 0.05))
-            blocks += self.gyro.read()
+            while new := self.gyro.read():
+                blocks += new
         return blocks
 
 

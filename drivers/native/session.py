@@ -30,7 +30,6 @@ from drivers.protocol.native import (
 REPEAT_INTERVAL = 0.2  # s between repetitions of a request
 ATTEMPTS = 5
 HEARTBEAT_PERIOD = 0.05  # s of host time; half of what the protocol asks, so that a late call does no harm
-HEARTBEAT_SPAN_US = 100_000  # of device time
 MAX_STREAM = 4096  # stream frames that wait for the driver; the index shows it if more came
 
 
@@ -195,14 +194,18 @@ class Session:
         return self._request_id
 
     def service(self) -> None:
-        """Take in what has arrived, and send the heartbeat if it is time. Never waits."""
+        """Send the heartbeat if it is time, and take in what has arrived. Never waits.
+
+        In this order a heartbeat acknowledges what the caller has had since the last call and could act on: an emulator
+        that runs ahead of real time by the heartbeats then meets every command at the same instant of its world.
+        """
+        if self._open:
+            self._beat()
         data = self._link.receive()
         if data:
             self._n_bytes += len(data)
             for body in self._decoder.feed(data):
                 self._sort(body)
-        if self._open:
-            self._beat()
 
     def take_stream(self) -> list[bytes]:
         """Service the link and return the bodies of the stream frames that have come, oldest first."""
@@ -250,7 +253,7 @@ class Session:
 
     def _beat(self) -> None:
         now = self._clock.now()
-        if self._seen_us - self._beaten_us >= HEARTBEAT_SPAN_US or now - self._beaten_at >= HEARTBEAT_PERIOD:
+        if self._seen_us > self._beaten_us or now - self._beaten_at >= HEARTBEAT_PERIOD:
             beat = build(MessageType.HEARTBEAT, session=self._number, seen_time_us=self._seen_us)
             self._link.write(encode_frame(beat))
             self._beaten_us, self._beaten_at = self._seen_us, now

@@ -34,6 +34,12 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     table.add_row("bias", f"{result['bias_dph']:.3f} deg/h" if isinstance(result["bias_dph"], float) else "")
     if result["scale_factor"] is not None:
         table.add_row("scale factor", f"{result['scale_factor']:.4f} ± {result['scale_factor_sd']:.4f}")
+    if result["n_rejected"]:
+        table.add_row("left out", f"{result['n_rejected']} disturbed seconds")
+    if result["rescaled_by"] > 1:
+        table.add_row(
+            "widened", f"the residuals do not fit the profile: the ± are {result['rescaled_by']:.2f} times its"
+        )
     for check in result["checks"]:
         mark = "[green]pass[/green]" if check["passed"] else "[red]FAIL[/red]"
         table.add_row(mark, printable(check["sentence"]))
@@ -45,8 +51,9 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
 
 
 def require_trustworthy(result: Mapping[str, Any]) -> None:
-    """Raise EstimateError if a check of the fix has failed; its figures have been shown, but must not be relied on."""
-    failed = [check["sentence"] for check in result.get("checks", []) if not check["passed"]]
+    """Raise EstimateError if a decisive check of the fix has failed: its figures must not be relied on."""
+    checks = result.get("checks", [])
+    failed = [check["sentence"] for check in checks if check["decisive"] and not check["passed"]]
     if failed:
         raise EstimateError(f"no trustworthy estimate: {failed[0]}")
 

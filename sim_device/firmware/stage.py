@@ -81,6 +81,7 @@ class StageDevice(Device):
         self._status_due_us = 0
         self._status_count = 0
         self._news = False  # a status frame is to go out at once
+        self.told_time_us = -1  # device time of the newest status frame
         self._config = (
             board.azimuth_limits[0],
             board.azimuth_limits[1],
@@ -269,6 +270,7 @@ class StageDevice(Device):
             return
         self._news = False
         self._session.send(self._status(now_us))
+        self.told_time_us = now_us
         self._status_count += 1
         self._status_due_us = now_us + (self._config[6] * 1000 if self._in_motion else _REST_STATUS_US)
 
