@@ -129,6 +129,7 @@ def test_a_stop_on_request_leaves_the_stage_at_rest(tmp_path: Path, state: State
 FAULTS = [
     ("stage:stall=azimuth@40", DeviceFaultError, "STALL"),
     ("stage:runaway=azimuth@46", DeviceFaultError, "RUNAWAY"),
+    ("stage:runaway=azimuth@50", DeviceFaultError, "RUNAWAY"),
     ("stage:encoder-jump=elevation@40", DeviceFaultError, "ENCODER"),
     ("stage:encoder-jump=elevation@50", DeviceFaultError, "ENCODER"),
     ("stage:limit-switch=azimuth@40", DeviceFaultError, "LIMIT_SWITCH"),

@@ -152,6 +152,11 @@ class Axis:
         forward = direction * rate if direction else -abs(rate)
         return RUNAWAY if direction * self.lag > 0 or forward < -_WRONG_WAY else STALL
 
+    @property
+    def runs(self) -> bool:
+        """Whether the encoder moves from one look to the next."""
+        return abs(self._rate_since(-2)) > _DEGREE // 10
+
     def rest(self) -> None:
         """Remember where the axis rests."""
         self._rest_reading = self.reading

@@ -76,6 +76,7 @@ class StageDevice(Device):
         self._in_motion = False
         self._in_position = False
         self._motion_us = 0
+        self._suspected_us = -1  # since when the stage at rest is not where it rested
         self._move_id = 0
         self._tick_due_us = 0
         self._status_due_us = 0
@@ -203,7 +204,7 @@ class StageDevice(Device):
             self._check_rest(now_us)
         if self._state == _FAULT:
             return error(FAULT_LATCHED, self._fault)
-        if self._in_motion:
+        if self._in_motion or self._suspected_us >= 0:
             return error(MOVING)
         return error(NOT_READY) if self._testing else None
 
@@ -261,7 +262,8 @@ class StageDevice(Device):
                 self._tick(now_us)
             else:
                 self._check_rest(now_us)
-            self._tick_due_us = now_us + (self._board.control_period_us if self._in_motion else _REST_CHECK_US)
+            soon = self._in_motion or self._suspected_us >= 0
+            self._tick_due_us = now_us + (self._board.control_period_us if soon else _REST_CHECK_US)
         self._conclude(now_us)
 
     def _conclude(self, now_us: int) -> None:
@@ -319,6 +321,7 @@ class StageDevice(Device):
     def _latch(self, fault: int, now_us: int) -> None:
         """Latch a fault, and bring the stage to rest if it moves."""
         self._fault = fault
+        self._suspected_us = -1
         self._in_position = False
         if fault in _LOSE_HOMING:
             self._homed = False
@@ -338,8 +341,12 @@ class StageDevice(Device):
         disturbed = [axis.disturbed(now_us) for axis in self._axes]
         if self._board.e_stop(now_us):
             self._latch(E_STOP, now_us)
-        elif self._homed and any(disturbed):
-            self._latch(ENCODER, now_us)
+        elif not (self._homed and any(disturbed)):
+            self._suspected_us = -1
+        elif self._suspected_us < 0:
+            self._suspected_us = now_us  # a second look tells an axis that runs from an encoder that has jumped
+        elif now_us > self._suspected_us:
+            self._latch(RUNAWAY if any(axis.runs for axis in self._axes) else ENCODER, now_us)
 
     def _tick(self, now_us: int) -> None:
         """Supervise and drive the stage in motion."""
