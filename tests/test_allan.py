@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from northfinder.errors import EstimateError
 from northfinder.estimation.allan import (
+    _second_difference_covariance,
     allan_curve,
     averaging_factors,
     degrees_of_freedom,
     overlapping_allan_deviation,
 )
 from northfinder.estimation.noise import NoiseModel
-from northfinder.estimation.noise_identification import KINDS, Identification, identify
+from northfinder.estimation.noise_identification import KINDS, Identification, _Bands, _regress, identify
 from northfinder.units import DPH
 from sim_device.plant.noise import NoiseCoefficients, RateNoise
 
@@ -76,6 +77,14 @@ def test_degrees_of_freedom_equal_greenhalls_for_each_pure_noise(kind: str, alph
     for n, factor in ((10_000, 100), (10_000, 1000), (1000, 200)):
         ours = degrees_of_freedom(NoiseModel(**{kind: 1e-6}), n, factor, 0.01)
         assert ours == pytest.approx(edf_greenhall(alpha, 2, factor, n + 1, overlapping=True), rel=0.01)
+
+
+def test_second_differences_have_the_allan_variance() -> None:
+    """Without lag their covariance is ``2 tau^2`` times the Allan variance of the mixed noise model."""
+    noise = NoiseModel(angle_random_walk=2e-6, bias_instability=3e-7, rate_random_walk=1e-7)
+    for tau in (0.1, 10.0, 1000.0):
+        covariance = _second_difference_covariance(noise, np.zeros(1), tau)[0]
+        assert covariance == pytest.approx(2.0 * tau**2 * noise.allan_deviation(tau) ** 2, rel=1e-9)
 
 
 def test_no_noise_has_no_degrees_of_freedom() -> None:
@@ -147,6 +156,25 @@ def test_a_single_kind_is_not_spread_over_others(kind: str) -> None:
     expected = NoiseModel(**{kind: true}).allan_deviation(tau)
     np.testing.assert_allclose(found.noise.allan_deviation(tau), expected, rtol=0.1)
     assert found.model_error == 0.0
+
+
+def test_angle_white_noise_of_the_ends_is_no_slow_noise() -> None:
+    """Over 20 records of pure angle white noise, at most 8 of 80 other coefficients appear: chance gives about 4."""
+    n_spurious = 0
+    for seed in range(20):
+        angle = np.random.default_rng(seed).standard_normal(6001)
+        found = identify(np.diff(angle) * 1e-6, 1.0)
+        assert of("angle_white_noise", found)[0] == pytest.approx(1e-6, rel=0.05)
+        n_spurious += sum(each.observable for each in found.coefficients[1:])
+    assert n_spurious <= 8
+
+
+def test_regressors_cost_three_degrees_of_freedom() -> None:
+    """The trend and the two end angles take three of the degrees of freedom, wherever the weights put them."""
+    bands = _Bands.of(np.random.default_rng(1).standard_normal(500), 0.5)
+    for weights in ([1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 1.0, 0.0], [0.1, 0.0, 0.0, 1.0]):
+        residual = _regress(bands, bands.spectra @ np.array(weights))
+        assert residual.dof.sum() == pytest.approx(499 - 3, abs=1e-3)
 
 
 def test_what_is_not_observable_is_zero_with_a_bound() -> None:
