@@ -44,9 +44,12 @@ class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
 class MeasurementTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """``[measurement]``: what to do with them."""
 
-    plan: str = "six-position"
-    dwell_s: float = 120.0
-    settle_s: float = 1.0
+    plan: str | None = None
+    dwell_s: float | None = None
+    time_s: float | None = None
+    until_sd_deg: float | None = None
+    azimuth_deg: float | None = None
+    settle_s: float = 0.5
     latitude_deg: float | None = None
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 
 from drivers.api import StageLimits
 from northfinder.errors import ConfigError
+from northfinder.estimation import Fix
 from northfinder.record import DwellSpan
 from northfinder.toml import read_toml
 
@@ -23,6 +24,7 @@ class Step:
     azimuth: float  #: rad, stage azimuth; any equivalent angle will do
     elevation: float  #: rad
     dwell: float  #: s of samples to use
+    from_north: bool = False  #: whether the azimuth is a true one, to be turned to the stage's by the running estimate
 
     def __post_init__(self) -> None:
         """Check what a stage and an estimator will rely on."""
@@ -35,11 +37,23 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """Where a measurement stands when its plan is asked for the next step."""
+
+    done: tuple[DwellSpan, ...] = ()  #: the finished dwells
+    fix: Fix | None = None  #: the estimate from them, None while there is none
+    elapsed: float = 0.0  #: s since the first slew began
+    azimuth: float = 0.0  #: rad, of the stage
+    elevation: float = 0.0  #: rad, of the stage
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Cyclogram:
-    """A fixed sequence of steps."""
+    """A sequence of steps; their true azimuths, if any, follow the running estimate."""
 
     name: str
     steps: tuple[Step, ...]
+    symmetric: bool = False  #: whether the true azimuths may be mirrored east-west and north-south to save turning
 
     def __post_init__(self) -> None:
         """Refuse an empty plan."""
@@ -51,16 +65,45 @@ class Cyclogram:
         """Sum of the dwells in s; slews and settling come on top."""
         return sum(step.dwell for step in self.steps)
 
-    def next_step(self, done: list[DwellSpan]) -> Step | None:
-        """Return the step after the finished dwells, None at the end."""
-        return self.steps[len(done)] if len(done) < len(self.steps) else None
+    @property
+    def n_steps(self) -> int:
+        """How many steps there are."""
+        return len(self.steps)
 
-    def remaining_dwell(self, done: list[DwellSpan]) -> float:
-        """Return the sum of the dwells still to come, in s."""
-        return sum(step.dwell for step in self.steps[len(done) :])
+    def next_step(self, standing: Standing) -> Step | None:
+        """Return the step after the finished dwells, None at the end; without an estimate stage zero is north."""
+        following = self.following(standing, azimuth=standing.fix.azimuth if standing.fix else 0.0)
+        return following[0] if following else None
+
+    def following(self, standing: Standing, *, azimuth: float) -> tuple[Step, ...]:
+        """Return the steps after the finished dwells in stage azimuths, given the true `azimuth` of stage zero, rad."""
+        first = next((i for i, step in enumerate(self.steps) if step.from_north), None)
+        following = self.steps[len(standing.done) :]
+        if first is None:
+            return following
+        present = standing.done[first].measured_azimuth if first < len(standing.done) else standing.azimuth
+        mirrors = _MIRRORS if self.symmetric else _MIRRORS[:1]
+        mirror = min(
+            mirrors,
+            key=lambda each: abs(math.remainder(each(self.steps[first].azimuth) - azimuth - present, 2 * math.pi)),
+        )
+        return tuple(_on_stage(step, mirror(step.azimuth), azimuth) if step.from_north else step for step in following)
+
+    def remaining_dwell(self, n_done: int) -> float:
+        """Return the sum of the dwells after the first `n_done`, in s."""
+        return sum(step.dwell for step in self.steps[n_done:])
+
+    def outline(self) -> object:
+        """Return what the record keeps of the plan."""
+        return self
 
     def check(self, limits: StageLimits) -> None:
         """Raise ConfigError if a stage with these limits cannot take all positions of the plan."""
+        if any(step.from_north for step in self.steps) and limits.azimuth_max - limits.azimuth_min < 2 * math.pi - 1e-9:
+            raise ConfigError(
+                f"the plan {self.name} may need any azimuth: the stage turns only from "
+                f"{math.degrees(limits.azimuth_min):g} to {math.degrees(limits.azimuth_max):g} deg"
+            )
         for step in self.steps:
             reachable_azimuth(step.azimuth, 0.0, limits.azimuth_min, limits.azimuth_max)
             if not limits.elevation_min - 1e-9 <= step.elevation <= limits.elevation_max + 1e-9:
@@ -68,6 +111,21 @@ class Cyclogram:
                     f"step {step.name} at elevation {math.degrees(step.elevation):g} deg cannot be reached: the stage "
                     f"turns from {math.degrees(limits.elevation_min):g} to {math.degrees(limits.elevation_max):g} deg"
                 )
+
+
+_MIRRORS: tuple[Callable[[float], float], ...] = (
+    lambda azimuth: azimuth,
+    lambda azimuth: -azimuth,
+    lambda azimuth: math.pi + azimuth,
+    lambda azimuth: math.pi - azimuth,
+)
+_COMPASS = ("north", "east", "south", "west")
+
+
+def _on_stage(step: Step, true_azimuth: float, azimuth: float) -> Step:
+    """Return a step of a true azimuth as one of the stage, whose zero points to `azimuth`; named by where it points."""
+    name = _COMPASS[round(true_azimuth / (math.pi / 2)) % 4] if step.name in _COMPASS else step.name
+    return replace(step, name=name, azimuth=true_azimuth - azimuth, from_north=False)
 
 
 #: The six positions of [S2]: U1 to U4 around the horizon, U5 up, U6 down; (azimuth, elevation) in deg.
@@ -124,6 +182,7 @@ class _StepTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     azimuth_deg: float
     elevation_deg: float
     dwell_s: float
+    from_north: bool = False
 
 
 class _CyclogramTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -144,6 +203,7 @@ def read_cyclogram(path: Path) -> Cyclogram:
                 azimuth=math.radians(step.azimuth_deg),
                 elevation=math.radians(step.elevation_deg),
                 dwell=step.dwell_s,
+                from_north=step.from_north,
             )
             for step in table.step
         )

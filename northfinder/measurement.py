@@ -110,10 +110,11 @@ class _Observer:
         """Show it."""
         self.watcher.show(progress, self.fix)
 
-    def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> None:
+    def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> Fix | None:
         """Reduce the dwell, and estimate as soon as that is possible."""
         self.reduction.add(span, blocks)
         try:
             self.fix = solve(self.reduction.means(), self.assumptions)
         except EstimateError:
             self.fix = None  # too early to tell
+        return self.fix

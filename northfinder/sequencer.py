@@ -17,8 +17,9 @@ from typing import Protocol
 
 from drivers.api import Clock, DeviceIdentity, Gyro, RateBlock, Stage, StageLimits, StageMode, StageState
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError
-from northfinder.cyclogram import Step, reachable_azimuth
+from northfinder.cyclogram import Standing, Step, reachable_azimuth
 from northfinder.errors import NorthFinderError, SequenceError
+from northfinder.estimation import Fix
 from northfinder.record import DwellSpan, Recorder
 
 
@@ -88,14 +89,21 @@ class Plan(Protocol):
     def name(self) -> str:
         """The plan's name."""
 
-    def next_step(self, done: list[DwellSpan]) -> Step | None:
-        """Return the step that follows the finished dwells, None when the plan is complete."""
-
-    def remaining_dwell(self, done: list[DwellSpan]) -> float:
-        """Return how many seconds of dwell are still to come after `done`, as far as known now."""
+    @property
+    def n_steps(self) -> int:
+        """How many steps it has, as far as known now."""
 
     def check(self, limits: StageLimits) -> None:
-        """Raise ConfigError if a stage with these limits cannot take all positions."""
+        """Get ready for a stage with these limits. Raises ConfigError if it cannot take all positions."""
+
+    def next_step(self, standing: Standing) -> Step | None:
+        """Return the next step, in stage azimuths; None when the plan is complete."""
+
+    def remaining_dwell(self, n_done: int) -> float:
+        """Return how many seconds of dwell are still to come after `n_done` dwells, as far as known now."""
+
+    def outline(self) -> object:
+        """Return what the record keeps of the plan: plain data or dataclasses, with ``name``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +112,7 @@ class Progress:
 
     state: State
     n_done: int = 0
+    n_steps: int = 0
     step: Step | None = None
     step_fraction: float = 0.0  #: how much of the present dwell is done
     remaining: float = 0.0  #: s of dwell still to come in the whole plan
@@ -119,8 +128,8 @@ class Observer(Protocol):
     def on_progress(self, progress: Progress) -> None:
         """Take note of where the measurement stands; called for every batch of samples."""
 
-    def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> None:
-        """Take note of a finished dwell and of the blocks that hold its samples."""
+    def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> Fix | None:
+        """Take note of a finished dwell and of the blocks that hold its samples; return the estimate so far, if any."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -133,12 +142,13 @@ class Sequencer:
     recorder: Recorder
     clock: Clock
     observer: Observer
-    settle: float = 1.0  #: s of samples left out after each slew
+    settle: float = 0.5  #: s of samples left out after each slew
     stop_requested: Callable[[], bool] = lambda: False
     gyro: Gyro | None = None
     stage: Stage | None = None
     identities: dict[str, DeviceIdentity] = field(default_factory=dict)
     spans: list[DwellSpan] = field(default_factory=list)
+    _fix: Fix | None = None  #: from the dwells so far
     _step: Step | None = None
     _next_index: int = 0  #: one past the newest sample
     _blocks: list[RateBlock] = field(default_factory=list)  #: of the present dwell
@@ -199,6 +209,7 @@ class Sequencer:
         self.recorder.set_meta("identities", self.identities)
         self.recorder.set_meta("sample_rate", gyro.sample_rate)
         self.plan.check(stage.limits)
+        self.recorder.set_meta("plan", self.plan.outline())
         return Event.OK
 
     def _self_test(self) -> Event:
@@ -223,10 +234,10 @@ class Sequencer:
 
     def _slew(self) -> Event:
         stage = self._devices()[1]
-        self._step = self.plan.next_step(self.spans)
+        state = self._service_stage()
+        self._step = self.plan.next_step(self._standing(state))
         if self._step is None:
             return Event.PLAN_COMPLETE
-        state = self._service_stage()
         limits = stage.limits
         azimuth = reachable_azimuth(self._step.azimuth, state.azimuth, limits.azimuth_min, limits.azimuth_max)
         travel = max(abs(azimuth - state.azimuth), abs(self._step.elevation - state.elevation))
@@ -274,7 +285,7 @@ class Sequencer:
         )
         self.spans.append(span)
         self.recorder.add_step(span)
-        self.observer.on_dwell(span, self._blocks)
+        self._fix = self.observer.on_dwell(span, self._blocks)
         return Event.OK
 
     def _finish(self) -> Event:
@@ -307,6 +318,15 @@ class Sequencer:
         if self.gyro is None or self.stage is None:
             raise SequenceError(f"state {self._now.value!r} came before the devices were opened")
         return self.gyro, self.stage
+
+    def _standing(self, state: StageState) -> Standing:
+        return Standing(
+            done=tuple(self.spans),
+            fix=self._fix,
+            elapsed=self.duration,
+            azimuth=state.azimuth,
+            elevation=state.elevation,
+        )
 
     def _present_step(self) -> Step:
         if self._step is None:
@@ -377,13 +397,14 @@ class Sequencer:
     def _report(self, block: RateBlock | None = None, *, first: int | None = None, stop: int = 0) -> None:
         fraction = 0.0 if first is None else min(1.0, (self._next_index - first) / (stop - first))
         step = self._step
-        to_come = self.plan.remaining_dwell(self.spans)
+        to_come = self.plan.remaining_dwell(len(self.spans))
         if step is not None:
             to_come -= fraction * step.dwell
         self.observer.on_progress(
             Progress(
                 state=self._now,
                 n_done=len(self.spans),
+                n_steps=self.plan.n_steps,
                 step=step,
                 step_fraction=fraction,
                 remaining=max(0.0, to_come),

@@ -90,7 +90,7 @@ def test_no_sample_of_a_slew_enters_a_dwell(tmp_path: Path) -> None:
     moving = [state.device_time for state in states if state.mode is not StageMode.IDLE]
     for span in spans:
         first, last = origin + span.first_index / 235, origin + (span.stop_index - 1) / 235
-        assert not [time for time in moving if first - 0.99 <= time < last - 0.001]
+        assert not [time for time in moving if first - 0.49 <= time < last - 0.001]
 
 
 def test_countdown_and_progress(tmp_path: Path) -> None:

@@ -10,11 +10,10 @@ from typing import Any
 from drivers.api import RateBlock
 from drivers.native import NativeGyro, NativeStage
 from drivers.transport.virtual import VirtualClock, VirtualLink
-from northfinder.cyclogram import Cyclogram
 from northfinder.estimation import Fix
 from northfinder.measurement import Measurement, Outcome, measure
 from northfinder.record import DwellSpan
-from northfinder.sequencer import Progress
+from northfinder.sequencer import Plan, Progress
 from northfinder.solution import Assumptions
 from sim_device.bench import SimBench
 from sim_device.faults import FaultSpec, FaultyLine, link_faults, schedule
@@ -46,13 +45,13 @@ class VirtualBench:
         line = FaultyLine(getattr(self.bench, name), link_faults(self._specs, name), seed=1)
         return VirtualLink(line, self.clock, name=f"virtual {name}")
 
-    def measure(self, record: Path, plan: Cyclogram, **changes: Any) -> Outcome:
+    def measure(self, record: Path, plan: Plan, **changes: Any) -> Outcome:  # noqa: ANN401  # handed through
         """Run a whole measurement on the bench; `changes` replace fields of the assumptions."""
         measurement = Measurement(
             open_gyro=self.open_gyro,
             open_stage=self.open_stage,
             plan=plan,
-            settle=1.0,
+            settle=0.5,
             assumptions=assume(**changes),
             record=record,
         )
@@ -68,7 +67,7 @@ def virtual_bench(
     return VirtualBench(SimBench(profile, seed=seed, azimuth=azimuth, latitude=latitude), faults)
 
 
-def assume(profile: str | None = "tvg43", **changes: Any) -> Assumptions:
+def assume(profile: str | None = "tvg43", **changes: Any) -> Assumptions:  # noqa: ANN401  # handed through
     """Return assumptions, those of the emulated gyro unless changed."""
     asked: dict[str, Any] = {"method": "generalised", "latitude_deg": None, "g_drift_dph": None} | changes
     return Assumptions.gather(profile=profile, **asked)

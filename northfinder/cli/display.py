@@ -31,11 +31,10 @@ class Display(Protocol):
 class LiveDisplay:
     """A table that is drawn anew in place."""
 
-    def __init__(self, live: Live, clock: Clock, n_steps: int) -> None:
+    def __init__(self, live: Live, clock: Clock) -> None:
         """Draw on `live`, at most each REFRESH_PERIOD by `clock`."""
         self._live = live
         self._clock = clock
-        self._n_steps = n_steps
         self._next = -math.inf
 
     def show(self, progress: Progress, fix: Fix | None) -> None:
@@ -49,7 +48,8 @@ class LiveDisplay:
     def _table(self, progress: Progress, fix: Fix | None) -> Table:
         table = Table.grid(padding=(0, 2))
         step = progress.step
-        name = "" if step is None else f"{step.name}, step {min(progress.n_done + 1, self._n_steps)} of {self._n_steps}"
+        number = min(progress.n_done + 1, progress.n_steps)
+        name = "" if step is None else f"{step.name}, step {number} of {progress.n_steps}"
         table.add_row("state", f"{progress.state.value} {name}")
         if progress.state is State.DWELL and step is not None:
             table.add_row("dwell", ProgressBar(total=1.0, completed=progress.step_fraction, width=40))
@@ -96,7 +96,7 @@ class SilentDisplay:
 class DisplayContext(AbstractContextManager[Display]):
     """Chooses the display for this terminal, and takes it down at the end."""
 
-    def __init__(self, clock: Clock, n_steps: int, *, quiet: bool) -> None:
+    def __init__(self, clock: Clock, *, quiet: bool) -> None:
         """Prepare; nothing is drawn yet."""
         console = Console(stderr=True)
         live = console.is_terminal and not quiet
@@ -104,7 +104,7 @@ class DisplayContext(AbstractContextManager[Display]):
         self._context: AbstractContextManager[object] = self._live or nullcontext()
         self._display: Display = SilentDisplay() if quiet else PlainDisplay()
         if self._live is not None:
-            self._display = LiveDisplay(self._live, clock, n_steps)
+            self._display = LiveDisplay(self._live, clock)
 
     def __enter__(self) -> Display:
         """Put the display up."""

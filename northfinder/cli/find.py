@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import signal
 import time
@@ -19,12 +20,12 @@ import msgspec
 from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import open_gyro, open_stage
 from drivers.transport.clock import SystemClock
+from northfinder.adaptive import Wishes, make_plan
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.options import estimation_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
-from northfinder.config import Config, GyroTable, StageTable, read_config
-from northfinder.cyclogram import find_cyclogram
+from northfinder.config import Config, GyroTable, MeasurementTable, StageTable, read_config
 from northfinder.errors import ConfigError
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
@@ -36,8 +37,21 @@ Device = TypeVar("Device", Gyro, Stage)
 @click.option("--gyro", "gyro_address", metavar="DRIVER:ADDRESS", help="Such as native:/dev/ttyUSB0.")
 @click.option("--stage", "stage_address", metavar="DRIVER:ADDRESS", help="Such as native:/dev/ttyUSB1.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), metavar="FILE", help="A bench as TOML.")
-@click.option("--plan", metavar="NAME|FILE", help="six-position (default), four-position, or a TOML file.")
-@click.option("--dwell", "dwell_s", type=click.FloatRange(min=1), metavar="S", help="Dwell of a built-in plan.")
+@click.option(
+    "--plan",
+    metavar="NAME|FILE",
+    help="refined (default with a profile), double, drift-balanced, four-position, six-position, or a TOML file.",
+)
+@click.option("--time", "time_s", type=click.FloatRange(min=10), metavar="S", help="From the first slew to the end.")
+@click.option(
+    "--until-sd",
+    "until_sd_deg",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="DEG",
+    help="Stop once the azimuth is this sure; after --time, or half an hour, in any case.",
+)
+@click.option("--azimuth", "azimuth_deg", type=float, metavar="DEG", help="Roughly known azimuth, for the plan double.")
+@click.option("--dwell", "dwell_s", type=click.FloatRange(min=1), metavar="S", help="Dwell of six or four positions.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("records"), show_default=True, metavar="DIR")
 @click.option("--quiet", is_flag=True, help="Show no progress.")
 @click.option("--sim-azimuth", type=float, default=33.0, show_default=True, metavar="DEG", help="The emulator's truth.")
@@ -52,6 +66,9 @@ def command(
     stage_address: str | None,
     config_file: Path | None,
     plan: str | None,
+    time_s: float | None,
+    until_sd_deg: float | None,
+    azimuth_deg: float | None,
     dwell_s: float | None,
     out: Path,
     quiet: bool,
@@ -90,36 +107,62 @@ def command(
         # The addresses follow once the emulator runs, which is only started for a command that is right otherwise.
         config = Config(gyro=GyroTable(address="", profile=sim_profile), stage=StageTable(address=""))
     wanted = config.measurement
-    cyclogram = find_cyclogram(plan or wanted.plan, dwell=dwell_s or wanted.dwell_s)
     assumptions = Assumptions.gather(
         profile=profile or config.gyro.profile,
         latitude_deg=wanted.latitude_deg if latitude_deg is None else latitude_deg,
         g_drift_dph=g_drift_dph,
         method=method,
     )
+    wishes = _wishes(
+        wanted, plan=plan, time_s=time_s, until_sd_deg=until_sd_deg, azimuth_deg=azimuth_deg, dwell_s=dwell_s
+    )
+    course = make_plan(wishes, assumptions, settle=wanted.settle_s)
     with ExitStack() as stack:
         if truth is not None:
             config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
         stop_requested = stack.enter_context(_stop_on_signal(clock))
-        display = stack.enter_context(DisplayContext(clock, len(cyclogram.steps), quiet=quiet))
+        display = stack.enter_context(DisplayContext(clock, quiet=quiet))
         measurement = Measurement(
             open_gyro=lambda: _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate),
             open_stage=lambda: _opened(
                 open_stage, config.stage.address, clock, baudrate=config.stage.baudrate, limits=config.stage.limits()
             ),
-            plan=cyclogram,
+            plan=course,
             settle=wanted.settle_s,
             assumptions=assumptions,
             record=_record_path(out),
-            meta={"northfinder": version("northfinder"), "config": config, "plan": cyclogram, "simulation": truth},
+            meta={"northfinder": version("northfinder"), "config": config, "simulation": truth},
         )
         outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
-    result = outcome.to_json() | {"plan": cyclogram.name, "wall_s": round(time.monotonic() - started, 3)}
+    result = outcome.to_json() | {"plan": course.name, "wall_s": round(time.monotonic() - started, 3)}
     if as_json:
         print_json(result)
     else:
         print_result(result, truth=None if truth is None else (truth.azimuth_deg, truth.latitude_deg))
     require_trustworthy(result)
+
+
+def _wishes(
+    table: MeasurementTable,
+    *,
+    plan: str | None,
+    time_s: float | None,
+    until_sd_deg: float | None,
+    azimuth_deg: float | None,
+    dwell_s: float | None,
+) -> Wishes:
+    """Return what the command line asks of the plan, and where it says nothing the configuration."""
+    if time_s is None and dwell_s is None:
+        time_s, dwell_s = table.time_s, table.dwell_s
+    until_sd_deg = table.until_sd_deg if until_sd_deg is None else until_sd_deg
+    azimuth_deg = table.azimuth_deg if azimuth_deg is None else azimuth_deg
+    return Wishes(
+        name=plan or table.plan,
+        time=time_s,
+        dwell=dwell_s,
+        until_sd=None if until_sd_deg is None else math.radians(until_sd_deg),
+        azimuth=None if azimuth_deg is None else math.radians(azimuth_deg),
+    )
 
 
 def _bench(gyro_address: str | None, stage_address: str | None, config_file: Path | None) -> Config | None:

@@ -1,0 +1,174 @@
+"""A plan in the course of a measurement: designed once the stage is known, kept to its time, ended when sure enough."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from drivers.api import StageLimits
+from northfinder.cyclogram import BUILT_IN, Cyclogram, Standing, Step, find_cyclogram
+from northfinder.errors import ConfigError, SequenceError
+from northfinder.estimation.planning import Prediction, Truth
+from northfinder.plans import MEASURE_LATITUDE, PLANS, Conditions, best, filled, following_turns, time_of_turns
+from northfinder.solution import Assumptions
+from northfinder.turns import Turns
+
+#: Time of a plan that fills whatever it is given, s.
+DEFAULT_TIME = 300.0
+#: The same where the measurement is to end at a standard deviation.
+DEFAULT_TIME_UNTIL_SD = 1800.0
+#: The last dwells are dropped rather than all that are left shortened below this part.
+_LEAST_FACTOR = 0.5
+_DEFAULT_DWELL = 120.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wishes:
+    """What the operator asks of a plan; None where nothing is asked. Times in s, angles in rad."""
+
+    name: str | None = None  #: a built-in plan, or a TOML file of a cyclogram
+    dwell: float | None = None  #: of each step of a built-in cyclogram
+    time: float | None = None  #: from the first slew to the end of the last dwell
+    until_sd: float | None = None  #: standard deviation of the azimuth that is enough
+    azimuth: float | None = None  #: roughly known true azimuth of stage azimuth zero
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Design:
+    """What a plan has become for the stage at hand."""
+
+    cyclogram: Cyclogram
+    turns: Turns
+    prediction: Prediction | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class AdaptivePlan:
+    """A cyclogram whose dwells are fitted into the time left before each step; a `northfinder.sequencer.Plan`."""
+
+    name: str
+    design: Callable[[Turns], Design]
+    settle: float  #: s
+    time: float | None = None  #: s from the first slew; None to leave the dwells as they are
+    until_sd: float | None = None  #: rad
+    azimuth: float | None = None  #: rad, coarse true azimuth of stage azimuth zero
+    _designed: Design | None = field(default=None, init=False)
+
+    @property
+    def n_steps(self) -> int:
+        """How many steps it has; 0 before the stage is known."""
+        return 0 if self._designed is None else len(self._designed.cyclogram.steps)
+
+    def check(self, limits: StageLimits) -> None:
+        """Design the plan for this stage. Raises ConfigError if the stage or the time does not do for it."""
+        self._designed = self.design(Turns.of_stage(limits, self.settle))
+        self._designed.cyclogram.check(limits)
+
+    def next_step(self, standing: Standing) -> Step | None:
+        """Return the next step, its dwell fitted into the time left; None when done, sure enough or out of time."""
+        fix, designed = standing.fix, self._require_design()
+        if self.until_sd is not None and fix is not None and fix.trustworthy and fix.azimuth_sd <= self.until_sd:
+            return None
+        azimuth = fix.azimuth if fix is not None else self.azimuth or 0.0
+        steps = list(following_turns(designed.cyclogram, standing, azimuth))
+        if self.time is None:
+            return steps[0] if steps else None
+        while steps:
+            turning = time_of_turns(steps, designed.turns, standing.azimuth, standing.elevation)
+            factor = (self.time - standing.elapsed - turning) / sum(step.dwell for step in steps)
+            if factor >= _LEAST_FACTOR:
+                return replace(steps[0], dwell=factor * steps[0].dwell)
+            steps.pop()
+        return None
+
+    def remaining_dwell(self, n_done: int) -> float:
+        """Return how many seconds of dwell are still to come after `n_done` dwells; 0 before the stage is known."""
+        return 0.0 if self._designed is None else self._designed.cyclogram.remaining_dwell(n_done)
+
+    def outline(self) -> object:
+        """Return what the record keeps of the plan."""
+        designed = self._require_design()
+        return {
+            "name": self.name,
+            "time_s": self.time,
+            "until_sd_deg": None if self.until_sd is None else math.degrees(self.until_sd),
+            "coarse_azimuth_deg": None if self.azimuth is None else math.degrees(self.azimuth),
+            "cyclogram": designed.cyclogram,
+            "predicted": designed.prediction,
+        }
+
+    def _require_design(self) -> Design:
+        if self._designed is None:
+            raise SequenceError(f"the plan {self.name} was asked for a step before it knew the stage")
+        return self._designed
+
+
+def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> AdaptivePlan:
+    """Return the plan that the operator wishes for; raises ConfigError if the wishes do not go together.
+
+    Without a name it is `refined`, or the published six positions if there is no noise model to plan by or a dwell is
+    given. Those and four positions keep their dwells unless a time is given; all other built-in plans fill a time.
+    """
+    searchable = assumptions.noise() is not None and wishes.dwell is None
+    name = wishes.name or ("refined" if searchable else "six-position")
+    _check_wishes(name, wishes, searchable=searchable)
+    searched = name in PLANS and searchable and (name not in BUILT_IN or wishes.time is not None)
+    time = wishes.time
+    if time is None and searched:
+        time = DEFAULT_TIME if wishes.until_sd is None else DEFAULT_TIME_UNTIL_SD
+
+    def design(turns: Turns) -> Design:
+        return (
+            _searched(name, time, wishes, assumptions, turns)
+            if searched and time
+            else _fixed(name, time, wishes, turns)
+        )
+
+    if not searched:
+        find_cyclogram(name)  # complains now, rather than once the devices are open
+    return AdaptivePlan(
+        name=name, design=design, settle=settle, time=time, until_sd=wishes.until_sd, azimuth=wishes.azimuth
+    )
+
+
+def _check_wishes(name: str, wishes: Wishes, *, searchable: bool) -> None:
+    if wishes.dwell is not None and wishes.time is not None:
+        raise ConfigError("a dwell and a time cannot both be given: the time says how long the dwells are")
+    if name == "double" and wishes.azimuth is None:
+        raise ConfigError("the plan double starts from a roughly known azimuth: give --azimuth")
+    if name in PLANS and name not in BUILT_IN and not searchable:
+        lacking = "chooses its dwells: give --time, not --dwell" if wishes.dwell else "needs the noise: give --profile"
+        raise ConfigError(f"the plan {name} {lacking}")
+
+
+def _fixed(name: str, time: float | None, wishes: Wishes, turns: Turns) -> Design:
+    """Return a cyclogram as it stands, or stretched to the time."""
+    cyclogram: Cyclogram | None = find_cyclogram(name, dwell=wishes.dwell or _DEFAULT_DWELL)
+    if time is not None and cyclogram is not None:
+        cyclogram = filled(cyclogram, turns, time, azimuth=wishes.azimuth or 0.0)
+    if cyclogram is None:
+        raise ConfigError(f"the plan {name} does not fit into {time:g} s: its dwells would be too short")
+    return Design(cyclogram=cyclogram, turns=turns)
+
+
+def _searched(name: str, time: float, wishes: Wishes, assumptions: Assumptions, turns: Turns) -> Design:
+    """Return the best plan of that name for the time."""
+    noise, known = assumptions.noise(), assumptions.known()
+    if noise is None:
+        raise SequenceError(f"the plan {name} was to be searched without a noise model")
+    truth = Truth()
+    truth = Truth(
+        azimuth=truth.azimuth if wishes.azimuth is None else wishes.azimuth,
+        latitude=truth.latitude if known.latitude is None else known.latitude,
+    )
+    conditions = Conditions(
+        noise=noise,
+        known=known,
+        turns=turns,
+        time=time,
+        needs_latitude=known.latitude is None and name in MEASURE_LATITUDE,
+        truth=truth,
+    )
+    found = best(name, conditions)
+    return Design(cyclogram=found.cyclogram, turns=turns, prediction=found.prediction)
