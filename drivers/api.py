@@ -55,18 +55,41 @@ class ByteLink(Protocol):
         """Release the port. Closing twice is no error."""
 
 
+#: Set in a `FrameLink` identifier of 29 bits, as in SocketCAN; identifiers of 11 bits stand alone.
+EXTENDED_IDENTIFIER = 1 << 31
+
+
+@dataclass(frozen=True, slots=True)
+class BusCounts:
+    """What has been heard on a bus since it was opened, by all links to it."""
+
+    n_frames: int = 0  #: data frames of any identifier
+    n_errors: int = 0  #: error frames, and errors that the adapter reports
+    n_remote: int = 0  #: remote frames, which nothing here asks for or answers
+    n_malformed: int = 0  #: what an adapter has sent that is no frame
+    identifiers: frozenset[int] = frozenset()  #: of 11 bits, of all data frames heard
+
+
 class FrameLink(Protocol):
-    """An open connection to a bus of addressed frames, such as CAN."""
+    """An open connection to a bus of addressed frames, such as CAN. Raises LinkError from every call once it is lost.
+
+    Several links may be open to one bus; each then gets all frames that it asked for, but none that another link of
+    this program has sent.
+    """
 
     @property
     def name(self) -> str:
-        """What an operator would call it, for messages."""
+        """What an operator would call it, for messages: ``socketcan:can0``."""
+
+    @property
+    def counts(self) -> BusCounts:
+        """What has been heard on the bus."""
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Queue one frame for sending."""
+        """Send one data frame; blocks while the bus takes no more, for a second at most."""
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return all frames that have arrived as (identifier, data). Never waits."""
+        """Return all data frames that have arrived as (identifier, data), oldest first. Never waits."""
 
     def close(self) -> None:
         """Release the bus. Closing twice is no error."""

@@ -72,6 +72,11 @@ def open_link(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -
     LinkError
         If the port does not exist, is in use, or may not be opened.
     """
+    return SerialLink(open_port(address, baudrate=baudrate), address, clock)
+
+
+def open_port(address: str, *, baudrate: int = DEFAULT_BAUDRATE) -> serial.Serial:
+    """Open a port for this program alone, for `read_some` and `write_all`; the rest is as `open_link` says."""
     url = _SOCKET_ADDRESS.fullmatch(address)
     if "://" in address and not (url and int(url[2]) < 2**16):
         raise LinkError(f"cannot open {address}: of all URLs only socket://HOST:PORT is that of a device")
@@ -86,7 +91,7 @@ def open_link(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -
     except (OSError, ValueError) as error:
         raise LinkError(f"cannot open {address}: {_why(error)}") from error
     _hasten(port, address)
-    return SerialLink(port, address, clock)
+    return port
 
 
 class SerialLink:
@@ -96,7 +101,6 @@ class SerialLink:
         self._port = port
         self._name = address
         self._clock = clock
-        self._selectable = _selectable(address)
         self._chunks: deque[bytes] = deque()
         self._closed = False
         self._lost = ""
@@ -112,11 +116,8 @@ class SerialLink:
         """Hand over all of `data` for sending; blocks while the port takes no more, for a second at most."""
         self._require_open()
         try:
-            if os.name == "posix":
-                _write_all(self._port.fileno(), data)
-            else:
-                self._port.write(data)
-        except (serial.SerialTimeoutException, TimeoutError) as error:
+            write_all(self._port, data)
+        except TimeoutError as error:
             raise LinkError(f"{self._name} takes no more bytes: nothing reads at its other end") from error
         except (OSError, ValueError) as error:
             self._lost = self._lost or f"{self._name} was unplugged ({error})"
@@ -152,39 +153,55 @@ class SerialLink:
             while not self._closed:
                 if len(self._chunks) >= _MAX_CHUNKS:
                     time.sleep(_POLL)
-                elif data := self._read_some():
+                elif data := read_some(self._port, _POLL):
                     self._chunks.append(data)
                     self._clock.notify()
         except (OSError, ValueError) as error:
             self._lost = f"{self._name} was unplugged ({error})"
             self._clock.notify()
 
-    def _read_some(self) -> bytes:
-        """Return what has come, waiting a little for the first byte."""
-        if self._selectable:
-            ready, _, _ = select.select([self._port.fileno()], [], [], _POLL)
-            size = _CHUNK if ready else 0
-        else:
-            size = min(_CHUNK, max(1, self._port.in_waiting))
-        if not size:
-            return b""
-        if os.name != "posix":
-            data: bytes = self._port.read(size)
-            return data
-        data = os.read(self._port.fileno(), size)
-        if not data:
-            raise ConnectionError("the other end is gone")
+
+def read_some(port: serial.Serial, timeout: float) -> bytes:
+    """Return what has come, waiting up to `timeout` s for the first byte (50 ms where it cannot be waited for).
+
+    Raises
+    ------
+    OSError
+        If the port is gone.
+    """
+    if port.timeout == 0:
+        ready, _, _ = select.select([port.fileno()], [], [], timeout)
+        size = _CHUNK if ready else 0
+    else:
+        size = min(_CHUNK, max(1, port.in_waiting))
+    if not size:
+        return b""
+    if os.name != "posix":
+        data: bytes = port.read(size)
         return data
+    data = os.read(port.fileno(), size)
+    if not data:
+        raise ConnectionError("the other end is gone")
+    return data
 
 
-def _write_all(descriptor: int, data: bytes) -> None:
-    """Write to a descriptor that does not block; pyserial's own write makes a second system call each time.
+def write_all(port: serial.Serial, data: bytes) -> None:
+    """Write to a port; pyserial's own write makes a second system call each time.
 
     Raises
     ------
     TimeoutError
-        If it takes nothing for `_WRITE_TIMEOUT`.
+        If it takes nothing for a second.
+    OSError
+        If the port is gone.
     """
+    if os.name != "posix":
+        try:
+            port.write(data)
+        except serial.SerialTimeoutException as error:
+            raise TimeoutError from error
+        return
+    descriptor = port.fileno()
     while data:
         try:
             data = data[os.write(descriptor, data) :]

@@ -27,6 +27,16 @@ class TimedDevice(Protocol):
         """Return when the device will next act if nothing reaches it, None for never."""
 
 
+class _Acting(Protocol):
+    """What takes part in virtual time."""
+
+    def due_us(self) -> int | None:
+        """Return when it will next act."""
+
+    def act(self, at_us: int) -> None:
+        """Do what was due at `at_us`."""
+
+
 class VirtualClock:
     """A `Clock` on which time passes only in `wait` and `sleep_until`, from one act of a device to the next.
 
@@ -36,7 +46,7 @@ class VirtualClock:
     def __init__(self) -> None:
         self._now_us = 0
         self._news = False
-        self._links: list[VirtualLink] = []
+        self._links: list[_Acting] = []
 
     @property
     def now_us(self) -> int:
@@ -64,11 +74,11 @@ class VirtualClock:
         """End the present `wait`, or else the next one."""
         self._news = True
 
-    def attach(self, link: VirtualLink) -> None:
+    def attach(self, link: _Acting) -> None:
         """Let `link` take part; called by the link itself."""
         self._links.append(link)
 
-    def detach(self, link: VirtualLink) -> None:
+    def detach(self, link: _Acting) -> None:
         """Let `link` take part no longer; called by the link itself."""
         if link in self._links:
             self._links.remove(link)
