@@ -39,6 +39,8 @@ _SQLITE = b"SQLite format 3\0"
 _ZIP = b"PK\x03\x04"
 #: Two samples further apart than this many sample periods have others missing between them.
 _GAP = 1.5
+_SAMPLE_RATES = (1e-4, 1e7)  #: Hz
+_MAX_RATE = 1e6  #: rad/s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,10 +204,15 @@ def _longest_run(position: Array, step: float) -> slice:
 
 def _series(rate: Array, run: slice, sample_rate: float) -> RateSeries:
     rate = np.asarray(rate, dtype=np.float64)
-    if not 0.0 < sample_rate < math.inf:
-        raise RecordError(f"the sample rate must be positive, not {sample_rate} Hz")
-    if not np.isfinite(rate).all():
-        raise RecordError(f"sample {int(np.argmin(np.isfinite(rate))) + 1} is not a finite rate")
+    if not _SAMPLE_RATES[0] <= sample_rate <= _SAMPLE_RATES[1]:
+        raise RecordError(
+            f"the sample rate is {sample_rate:g} Hz, expected {_SAMPLE_RATES[0]:g} to {_SAMPLE_RATES[1]:g}"
+        )
+    possible = np.abs(rate) <= _MAX_RATE  # false for what is no number
+    if not possible.all():
+        raise RecordError(
+            f"sample {int(np.argmin(possible)) + 1} is {rate[np.argmin(possible)]:g} rad/s, no rate of a gyro"
+        )
     taken, notes = rate[run], []
     if taken.size < rate.size:
         notes.append(

@@ -223,6 +223,31 @@ def test_a_record_that_shows_no_noise_is_refused(rate: Array, message: str) -> N
         identify(rate, 1.0)
 
 
+@pytest.mark.parametrize("sample_rate", [1.0, 100.0])
+@pytest.mark.parametrize(
+    "name", ["alternating", "sine", "step", "impulse", "ramp", "first", "cosine", "held", "cauchy"]
+)
+def test_a_curve_without_noise_is_refused_or_fitted(name: str, sample_rate: float) -> None:
+    """Whatever the record is, there are finite coefficients and a finite band, or one sentence."""
+    t = np.arange(3000.0)
+    curves = {
+        "alternating": (-1.0) ** t, "sine": np.sin(t / 7.0), "step": t > 1500, "impulse": t == 300, "ramp": 2.0 * t,
+        "first": t == 0, "cosine": np.cos(math.pi * 5 * (t + 0.5) / t.size),
+        "held": np.repeat(np.random.default_rng(1).standard_normal(30), 100),
+        "cauchy": np.random.default_rng(2).standard_cauchy(t.size),
+    }  # fmt: skip
+    rate = np.asarray(curves[name], dtype=np.float64)
+    try:
+        found = identify(rate, sample_rate)
+    except EstimateError:
+        assert name not in {"step", "impulse", "cauchy"}
+        return
+    band = allan_curve(rate, sample_rate, found.noise)
+    assert np.isfinite(band.low).all()
+    assert np.isfinite(band.high).all()
+    assert all(np.isfinite([each.value, each.sd or 0.0, each.upper_bound or 0.0]).all() for each in found.coefficients)
+
+
 def test_a_million_samples_take_less_than_two_seconds() -> None:
     """Identification and Allan deviation of 10,000 s at 100 Hz."""
     rate = np.random.default_rng(2).standard_normal(1_000_000) * 1e-3

@@ -146,11 +146,11 @@ def test_archive_of_several_axes_with_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rate_counts": np.array([1.0, np.nan])}, "sample 2 is not a finite rate"),
+        ({"rate_counts": np.array([1.0, np.nan])}, "sample 2 is nan rad/s"),
         ({"rate_counts": np.zeros((2, 2, 2))}, "expected (n,)"),
         ({"deg_s_per_count": "none"}, "name one with --column"),
         ({"sample_rate_hz": np.array([1.0, 2.0])}, "neither sample_rate_hz"),
-        ({"sample_rate_hz": -5.0}, "must be positive"),
+        ({"sample_rate_hz": -5.0}, "sample rate is -5 Hz"),
         ({"rate_counts": np.array([{}, {}], dtype=object)}, "name one with --column"),
     ],
 )

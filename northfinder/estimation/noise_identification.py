@@ -91,7 +91,7 @@ def identify(rate: ArrayLike, sample_rate: float) -> Identification:
     Raises
     ------
     EstimateError
-        The record is too short, or its rate never changes.
+        The record is too short, its rate never changes, or it is a curve without noise.
     """
     per_mean = max(1, round(SHORTEST_MEAN * sample_rate))
     samples = np.asarray(rate, dtype=np.float64)
@@ -104,7 +104,11 @@ def identify(rate: ArrayLike, sample_rate: float) -> Identification:
     means = samples[: n * per_mean].reshape(n, per_mean).mean(axis=1)
     if np.ptp(means) == 0.0:
         raise EstimateError("the rate never changes within the record, so it holds no noise to identify")
-    return _identify(_Bands.of(means, period))
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            return _identify(_Bands.of(means, period))
+    except (FloatingPointError, np.linalg.LinAlgError):
+        raise EstimateError("the rate follows a curve without noise, so there is none to identify") from None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,5 +234,5 @@ def _model_error(size: Array, excess: Array) -> float:
 
     if surplus(0.0, stats.chi2.ppf(1.0 - _IMPROBABLE, n)) <= 0.0:
         return 0.0
-    largest = math.sqrt(float(np.sum(excess[many] ** 2)))
+    largest = 2.0 * math.sqrt(float(np.sum(excess[many] ** 2)))
     return float(brentq(surplus, 0.0, largest, args=(n,)))
