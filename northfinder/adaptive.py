@@ -10,7 +10,8 @@ from drivers.api import StageLimits
 from northfinder.cyclogram import BUILT_IN, Cyclogram, Standing, Step, find_cyclogram
 from northfinder.errors import ConfigError, SequenceError
 from northfinder.estimation.planning import Prediction, Truth
-from northfinder.plans import MEASURE_LATITUDE, PLANS, Conditions, best, filled, following_turns, time_of_turns
+from northfinder.layouts import MEASURE_LATITUDE, PLANS
+from northfinder.plans import Conditions, candidates, filled, following_turns, time_of_turns
 from northfinder.solution import Assumptions
 from northfinder.turns import Turns
 
@@ -170,5 +171,5 @@ def _searched(name: str, time: float, wishes: Wishes, assumptions: Assumptions, 
         needs_latitude=known.latitude is None and name in MEASURE_LATITUDE,
         truth=truth,
     )
-    found = best(name, conditions)
+    (found,) = candidates(name, conditions)
     return Design(cyclogram=found.cyclogram, turns=turns, prediction=found.prediction)

@@ -1,22 +1,17 @@
-"""The built-in plans, and the search for the repetitions and dwells that make the most of a given time.
-
-A plan is written as a layout: an opening whose dwells are as short as the pointing needs, then a pattern that fills the
-time in the proportions given. Positions U1 to U6 are of the stage; north, east, south and west are true and follow the
-running estimate. Successive visits of one position are one dwell, so that the order E W W E makes the first and the
-last dwell half as long as the others.
-"""
+"""The search for the repetitions and dwells of a built-in plan that make the most of a given time."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle, groupby, islice
+from functools import lru_cache
 
-from northfinder.cyclogram import POSITIONS_DEG, Cyclogram, Standing, Step
+from northfinder.cyclogram import Cyclogram, Standing, Step
 from northfinder.errors import ConfigError, EstimateError
 from northfinder.estimation import Known, NoiseModel
 from northfinder.estimation.planning import PlannedDwell, Prediction, Truth, predict
+from northfinder.layouts import Family, families
 from northfinder.turns import Turns
 
 #: Shortest dwell worth a turn, s: enough seconds in it to tell which of them are disturbed.
@@ -25,24 +20,10 @@ SHORTEST_DWELL = 5.0
 OPENING_DWELLS = (5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 70.0, 100.0, 150.0, 240.0, 400.0)
 #: Standard deviation of the azimuth times cos(latitude), rad, after an opening that points well enough.
 OPENING_SD = math.radians(1.0)
-#: Pairs from a known azimuth stand off the east-west line by this, rad, to measure the north part of the rate as well.
-CROSSING = math.radians(8.0)
 #: How much more an error of the azimuth counts than one of the latitude, where both are wanted.
 AZIMUTH_WEIGHT = 2.0
-#: Longest plan that is predicted from means of 1 s; a longer one from as many longer means.
-N_MEANS = 960
-
-_TRUE_DEG = {"N": ("north", 0), "E": ("east", 90), "S": ("south", 180), "W": ("west", 270)}
-_LATITUDE_PATTERNS = ("EWUDNS", "EWEWUDNS", "ENUWSD")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
-    """A plan before the time is known: dwells are weights."""
-
-    name: str
-    opening: tuple[Step, ...] = ()
-    pattern: tuple[Step, ...]
+#: A search predicts from about this many means at most, of whole seconds; what it finds is predicted from means of 1 s.
+N_MEANS = 480
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,80 +46,6 @@ class Candidate:
     dwells: tuple[PlannedDwell, ...]
     prediction: Prediction
     score: float  #: rad, see `_score`
-
-
-def _stage_steps(order: str) -> tuple[Step, ...]:
-    """Return the positions U1 to U6 of `order`, as 13312442."""
-    steps = []
-    for digit, visits in groupby(order):
-        azimuth, elevation = (math.radians(angle) for angle in POSITIONS_DEG[f"U{digit}"])
-        steps.append(Step(name=f"U{digit}", azimuth=azimuth, elevation=elevation, dwell=float(len(list(visits)))))
-    return tuple(steps)
-
-
-def _true_steps(order: str) -> tuple[Step, ...]:
-    """Return true positions, N E S W U(p) D(own); up and down already stand at the azimuth of what follows."""
-    steps: list[Step] = []
-    azimuth = math.pi / 2
-    for letter in reversed(order):
-        elevation = {"U": math.pi / 2, "D": -math.pi / 2}.get(letter, 0.0)
-        name = {"U": "up", "D": "down"}.get(letter) or _TRUE_DEG[letter][0]
-        if letter in _TRUE_DEG:
-            azimuth = math.radians(_TRUE_DEG[letter][1])
-        steps.append(Step(name=name, azimuth=azimuth, elevation=elevation, dwell=1.0, from_north=True))
-    steps.reverse()
-    return (replace(steps[0], dwell=0.5), *steps[1:-1], replace(steps[-1], dwell=0.5))
-
-
-def _crossed_pairs(n: int) -> tuple[Step, ...]:
-    """Return `n` dwells alternately east and west, every second pair on the other side of the east-west line."""
-    side = (CROSSING, CROSSING, -CROSSING, -CROSSING)
-    pairs = _true_steps("".join(islice(cycle("EW"), n)))
-    return tuple(replace(step, azimuth=step.azimuth + side[i % 4]) for i, step in enumerate(pairs))
-
-
-def _refined(pattern: str, shortest: int) -> Callable[[int], Layout | None]:
-    def layout(n: int) -> Layout | None:
-        if n < shortest:
-            return None
-        return Layout(
-            name="refined", opening=_stage_steps("123"), pattern=_true_steps("".join(islice(cycle(pattern), n)))
-        )
-
-    return layout
-
-
-def _repeated(name: str, order: str, closing: str = "") -> Callable[[int], Layout | None]:
-    return lambda n: Layout(name=name, pattern=_stage_steps(order * n + closing))
-
-
-def _double(n: int) -> Layout | None:
-    return Layout(name="double", pattern=_crossed_pairs(n)) if n >= 3 else None
-
-
-def families(name: str, *, needs_latitude: bool) -> list[Callable[[int], Layout | None]]:
-    """Return the layouts of a plan, each by the number of its repetitions or dwells.
-
-    Raises ConfigError for a name that is no built-in plan.
-    """
-    if name == "refined":
-        patterns = [(each, 4) for each in _LATITUDE_PATTERNS] if needs_latitude else [("EW", 2)]
-        return [_refined(pattern, shortest) for pattern, shortest in patterns]
-    table: dict[str, list[Callable[[int], Layout | None]]] = {
-        "double": [_double],
-        "six-position": [_repeated(name, "12341561")],
-        "four-position": [_repeated(name, "1234", "1")],
-        "drift-balanced": [_repeated(name, "13312442"), _repeated(name, "1324423131422413")],
-    }
-    if name not in table:
-        raise ConfigError(f"no plan {name!r}: expected {', '.join(PLANS)}, or a TOML file of a cyclogram")
-    return table[name]
-
-
-#: Names of the built-in plans.
-PLANS = ("refined", "double", "drift-balanced", "four-position", "six-position")
-#: Those that turn the input axis up and down where the latitude is needed.
-MEASURE_LATITUDE = ("refined", "six-position")
 
 
 def timetable(cyclogram: Cyclogram, turns: Turns, azimuth: float) -> tuple[PlannedDwell, ...]:
@@ -168,8 +75,11 @@ def time_of_turns(steps: Sequence[Step], turns: Turns, azimuth: float, elevation
     return total
 
 
-def best(name: str, conditions: Conditions) -> Candidate:
-    """Return the best plan of that name for the conditions. Raises ConfigError if none of it fits the time."""
+def candidates(name: str, conditions: Conditions, *, n: int = 1) -> list[Candidate]:
+    """Return the `n` best plans of that name for the conditions, the best first.
+
+    Raises ConfigError if none of that name fits the time and determines an azimuth in it.
+    """
     found = [
         each
         for family in families(name, needs_latitude=conditions.needs_latitude)
@@ -179,10 +89,11 @@ def best(name: str, conditions: Conditions) -> Candidate:
         raise ConfigError(
             f"the plan {name} does not fit into {conditions.time:g} s, or determines no azimuth in that time"
         )
-    return min(found, key=lambda each: each.score)
+    shortlist = sorted(found, key=lambda each: each.score)[:n]
+    return sorted((_predicted_exactly(each, conditions) for each in shortlist), key=lambda each: each.score)
 
 
-def _search(family: Callable[[int], Layout | None], conditions: Conditions) -> list[Candidate]:
+def _search(family: Family, conditions: Conditions) -> list[Candidate]:
     """Return candidates around the best number of repetitions: the score falls, then rises with it."""
     candidates: dict[int, Candidate | None] = {}
 
@@ -202,7 +113,7 @@ def _search(family: Callable[[int], Layout | None], conditions: Conditions) -> l
     return [each for each in candidates.values() if each is not None]
 
 
-def _candidate(family: Callable[[int], Layout | None], n: int, conditions: Conditions) -> Candidate | None:
+def _candidate(family: Family, n: int, conditions: Conditions) -> Candidate | None:
     """Return the layout fitted into the time, None if that cannot be or determines no azimuth."""
     layout = family(n)
     opening = None if layout is None else _opening(layout.opening, conditions)
@@ -219,19 +130,26 @@ def _candidate(family: Callable[[int], Layout | None], n: int, conditions: Condi
         return None
     dwells = timetable(cyclogram, conditions.turns, conditions.truth.azimuth)
     try:
-        prediction = predicted(dwells, conditions)
+        prediction = predicted(dwells, conditions, interval=_interval(conditions))
     except EstimateError:
         return None
     score = _score(prediction, conditions)
     return None if score is None else Candidate(cyclogram=cyclogram, dwells=dwells, prediction=prediction, score=score)
 
 
-def predicted(dwells: Sequence[PlannedDwell], conditions: Conditions) -> Prediction:
+def _interval(conditions: Conditions) -> float:
+    """Return the length of the means that a search predicts from, s."""
+    return max(1.0, math.ceil(conditions.time / N_MEANS))
+
+
+def _predicted_exactly(candidate: Candidate, conditions: Conditions) -> Candidate:
+    prediction = predicted(candidate.dwells, conditions)
+    return replace(candidate, prediction=prediction, score=_score(prediction, conditions) or math.inf)
+
+
+def predicted(dwells: Sequence[PlannedDwell], conditions: Conditions, *, interval: float = 1.0) -> Prediction:
     """Return what the dwells will give. Raises EstimateError if they determine no azimuth."""
-    end = dwells[-1].start + dwells[-1].duration
-    return predict(
-        dwells, conditions.noise, conditions.known, conditions.truth, interval=max(1.0, math.ceil(end / N_MEANS))
-    )
+    return predict(dwells, conditions.noise, conditions.known, conditions.truth, interval=interval)
 
 
 def _score(prediction: Prediction, conditions: Conditions) -> float | None:
@@ -258,6 +176,7 @@ def filled(cyclogram: Cyclogram, turns: Turns, time: float, *, azimuth: float, n
     return replace(cyclogram, steps=fixed + tuple(replace(step, dwell=factor * step.dwell) for step in free))
 
 
+@lru_cache(maxsize=16)
 def _opening(steps: tuple[Step, ...], conditions: Conditions) -> tuple[Step, ...] | None:
     """Return the opening with the shortest dwells that point well enough, None if a third of the time does not do."""
     if not steps:

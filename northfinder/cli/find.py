@@ -42,7 +42,9 @@ Device = TypeVar("Device", Gyro, Stage)
     metavar="NAME|FILE",
     help="refined (default with a profile), double, drift-balanced, four-position, six-position, or a TOML file.",
 )
-@click.option("--time", "time_s", type=click.FloatRange(min=10), metavar="S", help="From the first slew to the end.")
+@click.option(
+    "--time", "time_s", type=click.FloatRange(min=10, max=3600), metavar="S", help="From the first slew to the end."
+)
 @click.option(
     "--until-sd",
     "until_sd_deg",
