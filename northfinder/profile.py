@@ -29,8 +29,23 @@ class NoiseTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
                 raise ValueError(f"{name} must be zero or positive, not {value}")
 
 
+class ErrorTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Standard deviations of what the data cannot show: they go into the uncertainty of every fix."""
+
+    tilt_sd_arcsec: float = 0.0  #: of the measured tilt, a constant error either way
+    stage_angle_sd_arcsec: float = 0.0  #: of either stage angle at a position, the same at each visit
+    misalignment_sd_arcsec: float = 0.0  #: of the input axis against the stage, either way
+
+    def __post_init__(self) -> None:
+        """Check that every standard deviation can be one."""
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} must be zero or positive, not {value}")
+
+
 class GyroProfile(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """A gyro's data sheet: noise, and the terms a fix is corrected for, each with its standard deviation."""
+    """A gyro's data sheet on its stage: noise, terms a fix is corrected for, errors that nobody can correct."""
 
     name: str
     noise: NoiseTable
@@ -38,6 +53,7 @@ class GyroProfile(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     acceleration_sensitive_drift_rate_sd_dph_per_g: float = 0.0
     scale_factor: float | None = None
     scale_factor_sd: float = 0.0
+    errors: ErrorTable = ErrorTable()
 
 
 def built_in_profiles() -> list[str]:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from northfinder.budget_report import budget_to_json
+from northfinder.calibration import Calibration, RatioTable
 from northfinder.errors import ConfigError
 from northfinder.estimation import Check, Fix, Known, NoiseModel, RateMeans, estimate
+from northfinder.estimation.budget import Declared, declared_variance, error_budget
+from northfinder.estimation.calibration import with_ratio
 from northfinder.estimation.disturbance import undisturbed
-from northfinder.profile import GyroProfile, find_profile
-from northfinder.units import DPH
+from northfinder.estimation.geometry import wrapped
+from northfinder.estimation.least_squares import Weights
+from northfinder.profile import GyroProfile, NoiseTable, find_profile
+from northfinder.units import ARCSEC, DPH
 
 Method = Literal["generalised", "ordinary"]
 
@@ -22,33 +28,69 @@ class Assumptions:
     method: Method = "generalised"
     profile: GyroProfile | None = None
     latitude_deg: float | None = None  #: None to measure it
-    g_drift_dph: float | None = None  #: in place of the profile's acceleration-sensitive drift rate, deg/h per g
+    latitude_sd_deg: float = 0.0
+    g_drift_dph: float | None = None  #: in place of any other acceleration-sensitive drift rate, deg/h per g
+    calibration: Calibration | None = None  #: in place of the profile's constants
 
     @classmethod
     def gather(
-        cls, *, method: Method, profile: str | None, latitude_deg: float | None, g_drift_dph: float | None
+        cls,
+        *,
+        method: Method,
+        profile: str | None,
+        latitude_deg: float | None,
+        g_drift_dph: float | None,
+        latitude_sd_deg: float = 0.0,
+        calibration: Calibration | None = None,
     ) -> Assumptions:
         """Look up the profile and check that all goes together. Raises ConfigError."""
         if g_drift_dph is not None and not math.isfinite(g_drift_dph):
             raise ConfigError(f"the acceleration-sensitive drift rate must be a finite number, not {g_drift_dph}")
-        found = None if profile is None else find_profile(profile)
-        return cls(method=method, profile=found, latitude_deg=latitude_deg, g_drift_dph=g_drift_dph)
+        if latitude_sd_deg and latitude_deg is None:
+            raise ConfigError("a standard deviation of the latitude needs the latitude")
+        return cls(
+            method=method,
+            profile=None if profile is None else find_profile(profile),
+            latitude_deg=latitude_deg,
+            latitude_sd_deg=latitude_sd_deg,
+            g_drift_dph=g_drift_dph,
+            calibration=calibration,
+        )
+
+    @property
+    def ratio(self) -> RatioTable | None:
+        """The calibrated ratio of the scale factors, None unless that model is to be applied."""
+        calibration = self.calibration
+        applied = calibration is not None and calibration.model == "ratio" and self.g_drift_dph is None
+        return calibration.ratio if applied and calibration is not None else None
 
     def known(self) -> Known:
         """Return what the estimator may rely on, in SI."""
-        profile = self.profile
-        drift, drift_sd = 0.0, 0.0
-        if profile is not None:
-            drift = profile.acceleration_sensitive_drift_rate_dph_per_g
-            drift_sd = profile.acceleration_sensitive_drift_rate_sd_dph_per_g
-        if self.g_drift_dph is not None:
-            drift, drift_sd = self.g_drift_dph, 0.0
+        profile, scale_factor = self._profile(), self._scale_factor()
+        drift, drift_sd = self._drift_dph()
         return Known(
             latitude=None if self.latitude_deg is None else math.radians(self.latitude_deg),
-            scale_factor=None if profile is None else profile.scale_factor,
-            scale_factor_sd=0.0 if profile is None else profile.scale_factor_sd,
+            latitude_sd=math.radians(self.latitude_sd_deg),
+            scale_factor=scale_factor[0],
+            scale_factor_sd=scale_factor[1],
             acceleration_sensitive_drift_rate=drift * DPH,
             acceleration_sensitive_drift_rate_sd=drift_sd * DPH,
+            tilt_sd=profile.errors.tilt_sd_arcsec * ARCSEC,
+        )
+
+    def declared(self) -> Declared:
+        """Return what is known of errors that the estimator does not see."""
+        errors, calibration, ratio = self._profile().errors, self.calibration, self.ratio
+        azimuth = None if calibration is None else calibration.azimuth
+        drift = calibration is not None and ratio is None and self.g_drift_dph is None
+        return Declared(
+            stage_angle_sd=errors.stage_angle_sd_arcsec * ARCSEC,
+            misalignment_sd=errors.misalignment_sd_arcsec * ARCSEC,
+            azimuth_offset=0.0 if azimuth is None else math.radians(azimuth.offset_deg),
+            azimuth_offset_sd=None if azimuth is None else math.radians(azimuth.offset_sd_deg),
+            scale_drift_correlation=calibration.acceleration_sensitive.correlation if drift and calibration else 0.0,
+            ratio=1.0 if ratio is None else ratio.ratio,
+            ratio_sd=0.0 if ratio is None else ratio.ratio_sd,
         )
 
     def noise(self) -> NoiseModel | None:
@@ -58,20 +100,113 @@ class Assumptions:
         table = self.profile.noise
         return NoiseModel.from_field_units(**{name: getattr(table, name) for name in table.__struct_fields__})
 
+    def _profile(self) -> GyroProfile:
+        return GyroProfile(name="", noise=NoiseTable()) if self.profile is None else self.profile
+
+    def _scale_factor(self) -> tuple[float | None, float]:
+        if self.calibration is not None and self.ratio is None:
+            table = self.calibration.acceleration_sensitive
+            return table.scale_factor, table.scale_factor_sd
+        profile = self._profile()
+        return profile.scale_factor, profile.scale_factor_sd
+
+    def _drift_dph(self) -> tuple[float, float]:
+        """Return the acceleration-sensitive drift rate and its sd: as given, as calibrated, or as in the profile."""
+        if self.g_drift_dph is not None:
+            return self.g_drift_dph, 0.0
+        if self.ratio is not None:
+            return 0.0, 0.0
+        if self.calibration is not None:
+            table = self.calibration.acceleration_sensitive
+            return table.drift_rate_dph_per_g, table.drift_rate_sd_dph_per_g
+        profile = self._profile()
+        return (
+            profile.acceleration_sensitive_drift_rate_dph_per_g,
+            profile.acceleration_sensitive_drift_rate_sd_dph_per_g,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Means as they are used, and how."""
+
+    means: RateMeans
+    noise: NoiseModel | None
+    drift: Literal["constant", "linear"]
+    weights: Weights
+    n_rejected: int
+
+    @classmethod
+    def of(cls, means: RateMeans, assumptions: Assumptions) -> _Problem:
+        """With a noise model short means weighted by it; without one dwells that count alike and a bias that drifts."""
+        noise = assumptions.noise()
+        if assumptions.method == "generalised" and noise is not None:
+            keep = undisturbed(means)
+            return cls(means.select(keep), noise, "constant", "generalised", means.n - int(keep.sum()))
+        return cls(means.per_dwell(), noise, "linear" if noise is None else "constant", "ordinary", 0)
+
+    def estimate(self, known: Known) -> Fix:
+        """Return the fix of the estimator alone."""
+        return estimate(
+            self.means,
+            noise=self.noise,
+            known=known,
+            drift=self.drift,
+            weights=self.weights,
+            n_rejected=self.n_rejected,
+        )
+
 
 def solve(means: RateMeans, assumptions: Assumptions) -> Fix:
-    """Estimate the fix from means over short intervals. Raises EstimateError.
+    """Estimate the fix from means over short intervals, and apply the calibration. Raises EstimateError.
 
     With a noise model the short means are weighted by it; without one the dwells count alike, the bias may drift, and
-    the standard deviations come from the residuals.
+    the standard deviations come from the residuals. Declared uncertainties are added to those of the estimate.
     """
-    noise, known = assumptions.noise(), assumptions.known()
-    if assumptions.method == "generalised" and noise is not None:
-        keep = undisturbed(means)
-        n_rejected = means.n - int(keep.sum())
-        return estimate(means.select(keep), noise=noise, known=known, weights="generalised", n_rejected=n_rejected)
-    drift: Literal["constant", "linear"] = "linear" if noise is None else "constant"
-    return estimate(means.per_dwell(), noise=noise, known=known, drift=drift)
+    problem, known, declared = _Problem.of(means, assumptions), assumptions.known(), assumptions.declared()
+    fix = _planes_estimated(problem, known, declared)
+    added = declared_variance(
+        problem.means, fix, noise=problem.noise, known=known, drift=problem.drift, weights=problem.weights,
+        declared=replace(declared, azimuth_offset=0.0),
+    )  # fmt: skip
+    return replace(
+        fix,
+        azimuth=wrapped(fix.azimuth - declared.azimuth_offset),
+        azimuth_sd=math.sqrt(max(fix.azimuth_sd**2 + added[0], 0.0)),
+        latitude_sd=None if fix.latitude_sd is None else math.sqrt(max(fix.latitude_sd**2 + added[1], 0.0)),
+    )
+
+
+def _planes_estimated(problem: _Problem, known: Known, declared: Declared) -> Fix:
+    """Return the estimator's fix, with the calibrated ratio of the two planes if there is one."""
+    if declared.ratio == 1.0 and declared.ratio_sd == 0.0:
+        return problem.estimate(known)
+    fix = problem.estimate(Known(tilt_sd=known.tilt_sd))
+    if fix.latitude is None:  # no vertical plane was measured
+        return problem.estimate(known)
+    return with_ratio(fix, known, ratio=declared.ratio, ratio_sd=declared.ratio_sd)
+
+
+def supplement(means: RateMeans, assumptions: Assumptions, fix: Fix) -> dict[str, Any]:
+    """Return what a report says beside the fix that `solve` gave: its uncertainty budget, the calibration applied."""
+    problem = _Problem.of(means, assumptions)
+    budget = error_budget(
+        problem.means, fix, noise=problem.noise, known=assumptions.known(), drift=problem.drift,
+        weights=problem.weights, declared=assumptions.declared(),
+    )  # fmt: skip
+    return {"budget": budget_to_json(budget)} | calibration_to_json(assumptions)
+
+
+def calibration_to_json(assumptions: Assumptions) -> dict[str, Any]:
+    """Return which calibration was applied and how, nothing if there was none."""
+    calibration = assumptions.calibration
+    if calibration is None:
+        return {}
+    model = "given drift rate" if assumptions.g_drift_dph is not None else calibration.model
+    named = {"serial_number": calibration.serial_number, "date": str(calibration.date)}
+    offset = None if calibration.azimuth is None else calibration.azimuth.offset_deg
+    until = {"valid_until": str(calibration.valid_until), "model": model, "azimuth_offset_deg": offset}
+    return {"calibration": named | until}
 
 
 def fix_to_json(fix: Fix) -> dict[str, Any]:

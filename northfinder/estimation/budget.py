@@ -42,6 +42,8 @@ class Declared:
     azimuth_offset: float = 0.0  #: rad, calibrated, taken off the azimuth already
     azimuth_offset_sd: float | None = None  #: rad, None if it was not calibrated
     scale_drift_correlation: float = 0.0  #: of the known scale factor and acceleration-sensitive drift rate
+    ratio: float = 1.0  #: k of (12), put on the vertical rate already
+    ratio_sd: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +113,7 @@ def error_budget(
     """
     declared = declared or Declared()
     path = Propagation.of(means, noise=noise, known=known, drift=drift, weights=weights)
-    gain = gains(fix, known, azimuth=fix.azimuth + declared.azimuth_offset, vertical=path.vertical)
+    fix, gain = _through_ratio(path, fix, known, declared)
     lines = [*_noise_lines(path, fix, gain), *_known_lines(path, fix, known, gain, declared)]
     lines += _declared_lines(path, fix, known, gain, declared)
     return Budget(tuple(sorted(lines, key=lambda line: (-line.azimuth, -line.latitude))))
@@ -125,14 +127,22 @@ def declared_variance(
 
     Parameters as for `error_budget`. The correlation of two known quantities may take something off.
     """
-    if declared == replace(Declared(), azimuth_offset=declared.azimuth_offset):
+    beside = (declared.stage_angle_sd, declared.misalignment_sd, declared.azimuth_offset_sd)
+    if not any(beside) and not declared.scale_drift_correlation:
         return np.zeros(2)
     path = Propagation.of(means, noise=noise, known=known, drift=drift, weights=weights)
-    gain = gains(fix, known, azimuth=fix.azimuth + declared.azimuth_offset, vertical=path.vertical)
+    fix, gain = _through_ratio(path, fix, known, declared)
     lines = _declared_lines(path, fix, known, gain, declared)
     added = np.sum([(line.azimuth**2, line.latitude**2) for line in lines], axis=0)
     covariance = declared.scale_drift_correlation * known.scale_factor_sd * known.acceleration_sensitive_drift_rate_sd
     return np.asarray(added - 2.0 * gain.scale_factor * gain.rates[:, 2] * covariance)
+
+
+def _through_ratio(path: Propagation, fix: Fix, known: Known, declared: Declared) -> tuple[Fix, Gains]:
+    """Return the fix with its rates as measured, before the ratio k, and the gains of those."""
+    gain = gains(fix, known, azimuth=fix.azimuth + declared.azimuth_offset, vertical=path.vertical)
+    planes = np.array([1.0, 1.0, declared.ratio if path.vertical else 1.0])
+    return replace(fix, rates=fix.rates / planes), replace(gain, rates=gain.rates * planes)
 
 
 def _line(quantity: str, sd: float, unit: str, evaluation: Literal["A", "B"], by: Iterable[Array]) -> Contribution:
@@ -181,6 +191,9 @@ def _known_lines(path: Propagation, fix: Fix, known: Known, gain: Gains, declare
         _line("acceleration-sensitive drift rate", drift_alone_sd, "rad/s/g", "B", [drift_alone_sd * gain.rates[:, 2]]),
         _line("latitude entry", known.latitude_sd, "rad", "B", [known.latitude_sd * gain.latitude]),
     ]
+    if declared.ratio_sd:
+        by_ratio = gain.rates[:, 2] * fix.rates[2] / declared.ratio
+        lines.append(_line("ratio of the scale factors", declared.ratio_sd, "1", "B", [declared.ratio_sd * by_ratio]))
     if not path.vertical:
         sd = _assumed_vertical(known)[1]
         lines.append(_line("vertical earth rate", sd, "rad/s", "B", [sd * gain.rates @ path.by_assumed_vertical()]))
