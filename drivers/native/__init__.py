@@ -17,7 +17,7 @@ def open_gyro(
     *,
     baudrate: int = DEFAULT_BAUDRATE,
     sample_rate: float | None = None,
-    block_samples: int | None = None,
+    block_duration: float = 0.5,
 ) -> Gyro:
     """Open the port of a native gyro; `connect` then speaks to it.
 
@@ -27,7 +27,7 @@ def open_gyro(
         If the port cannot be opened.
     """
     link = open_link(address, clock, baudrate=baudrate)
-    return NativeGyro(link, clock, sample_rate=sample_rate, block_samples=block_samples)
+    return NativeGyro(link, clock, sample_rate=sample_rate, block_duration=block_duration)
 
 
 def open_stage(

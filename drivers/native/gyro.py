@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from construct import Container
 from numpy.typing import NDArray
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
@@ -21,7 +22,8 @@ from drivers.protocol.native import (
     decode_samples,
 )
 
-MAX_SILENCE = 1.0  # s, or five blocks if that is longer
+MAX_SILENCE = 1.0  # s, or three blocks if that is longer
+MAX_BLOCK_SAMPLES = {1: 119, 3: 39}  # by axes: what a frame of 512 bytes holds
 _INDEX_SPAN = 2**32
 _KNOWN_STATUS = sum(GyroStatus)
 _HEAD = ["first_index", "device_time_us", "status", "temperature", "overrun_count", "tilt_x", "tilt_y"]
@@ -38,8 +40,8 @@ class NativeGyro:
         The clock that `link` notifies.
     sample_rate
         Samples a second to ask for, None to leave it.
-    block_samples
-        Samples a block to ask for, None to leave it.
+    block_duration
+        Length of a block to ask for, s, None to leave it. The longest that a frame holds if that is shorter.
     draw_session
         Draws session numbers.
     """
@@ -50,15 +52,13 @@ class NativeGyro:
         clock: Clock,
         *,
         sample_rate: float | None = None,
-        block_samples: int | None = None,
+        block_duration: float | None = None,
         draw_session: Callable[[], int] = random_session,
     ) -> None:
         self._clock = clock
         self._session = Session(link, clock, kind=DeviceKind.GYRO, draw_session=draw_session)
-        self._wanted = {
-            "sample_rate_millihz": round((sample_rate or 0.0) * 1000),
-            "block_samples": block_samples or 0,
-        }
+        self._wanted_rate_millihz = round((sample_rate or 0.0) * 1000)
+        self._wanted_block = block_duration
         self._sample_rate = 0.0
         self._range = 0.0
         self._n_axes = 0
@@ -107,21 +107,37 @@ class NativeGyro:
         """
         self._streaming = False
         identity = self._session.open()
-        if any(self._wanted.values()):
-            request, fields = MessageType.SET_CONFIG_GYRO, self._wanted
+        config = self._configure()
+        self._sample_rate = config.sample_rate_millihz / 1000
+        self._n_axes = config.n_axes
+        self._range = config.range_dph * RATE_LSB * 2**10
+        self._max_silence = max(MAX_SILENCE, 3 * config.block_samples / self._sample_rate)
+        return identity
+
+    def _configure(self) -> Container:
+        """Ask for the sample rate and the block length wanted; return the configuration in force."""
+        if self._wanted_rate_millihz:
+            config = self._set(sample_rate_millihz=self._wanted_rate_millihz, block_samples=0)
         else:
-            request, fields = MessageType.GET_CONFIG, {}
-        config = self._session.request(request, reply=MessageType.GYRO_CONFIG, **fields)
+            config = self._checked(self._session.request(MessageType.GET_CONFIG, reply=MessageType.GYRO_CONFIG))
+        if self._wanted_block is None:
+            return config
+        wanted = round(self._wanted_block * config.sample_rate_millihz / 1000)
+        block_samples = max(1, min(wanted, MAX_BLOCK_SAMPLES[config.n_axes]))
+        return self._set(sample_rate_millihz=0, block_samples=block_samples)
+
+    def _set(self, **fields: int) -> Container:
+        return self._checked(
+            self._session.request(MessageType.SET_CONFIG_GYRO, reply=MessageType.GYRO_CONFIG, **fields)
+        )
+
+    def _checked(self, config: Container) -> Container:
         if config.n_axes not in {1, 3} or not config.sample_rate_millihz or not config.block_samples:
             raise ProtocolError(
                 f"{self._session.name} reports an impossible configuration: {config.n_axes} axes, "
                 f"{config.sample_rate_millihz} mHz, {config.block_samples} samples a block"
             )
-        self._sample_rate = config.sample_rate_millihz / 1000
-        self._n_axes = config.n_axes
-        self._range = config.range_dph * RATE_LSB * 2**10
-        self._max_silence = max(MAX_SILENCE, 5 * config.block_samples / self._sample_rate)
-        return identity
+        return config
 
     def self_test(self) -> SelfTest:
         """Run the device's self-test, up to 3 s."""

@@ -11,10 +11,10 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from northfinder.estimation.geometry import sensitivity
 from northfinder.estimation.means import RateMeans
+from northfinder.estimation.quantiles import chi_square, student_t
 from northfinder.units import DPH
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ def residuals(name: str, chi2: float, dof: int) -> Check:
     Not decisive: where they are larger the standard deviations of the fix are widened.
     """
     value = chi2 / dof
-    high, low = (float(quantile(FALSE_ALARM / 2.0, dof)) / dof for quantile in (stats.chi2.isf, stats.chi2.ppf))
+    high, low = (chi_square(tail, dof) / dof for tail in (FALSE_ALARM / 2.0, 1.0 - FALSE_ALARM / 2.0))
     passed = low <= value <= high
     verdict = "fits" if passed else "does not fit"
     sentence = f"the noise model {verdict}: {name} are {math.sqrt(value):.3g} times what it predicts"
@@ -68,7 +68,7 @@ def residuals(name: str, chi2: float, dof: int) -> Check:
 
 def agreement(name: str, difference: float, sd: float, unit: str, sd_dof: float) -> Check:
     """Return whether an estimate agrees with what was known ahead; `unit` is "rad" or "1"."""
-    limit = float(stats.t.isf(FALSE_ALARM / 2.0, sd_dof)) * sd
+    limit = student_t(FALSE_ALARM / 2.0, sd_dof) * sd
     passed = abs(difference) <= limit
     factor, shown = (math.degrees(1.0), " deg") if unit == "rad" else (1.0, "")
     verdict = "agrees" if passed else "does not agree"
@@ -130,7 +130,7 @@ def _repeats(groups: list[list[int]], n: int) -> list[Array]:
 
 
 def _closure(name: str, values: list[tuple[float, float]], sd_dof: float) -> Check:
-    factor = float(stats.t.isf(FALSE_ALARM / 2.0 / len(values), sd_dof))
+    factor = student_t(FALSE_ALARM / 2.0 / len(values), sd_dof)
     value, sd = max(values, key=lambda pair: abs(pair[0]) - factor * pair[1])
     passed = abs(value) <= factor * sd
     verdict = "agree" if passed else "do not agree"

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from northfinder.estimation.checks import Check
+from northfinder.estimation.quantiles import student_t
 
 Array = NDArray[np.float64]
 
@@ -76,4 +76,4 @@ class Fix:
 
     def coverage_factor(self, probability: float = 0.95) -> float:
         """Return how many standard deviations on either side hold the truth with `probability` (Student t)."""
-        return float(stats.t.ppf(0.5 + probability / 2.0, self.sd_dof))
+        return student_t(0.5 - probability / 2.0, self.sd_dof)

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from northfinder.errors import EstimateError
 from northfinder.estimation import checks
@@ -29,6 +28,7 @@ from northfinder.estimation.linear import (
 )
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
+from northfinder.estimation.quantiles import chi_square
 from northfinder.units import EARTH_RATE
 
 Array = NDArray[np.float64]
@@ -179,7 +179,7 @@ def _propagate(inverse: Array, covariance: Array) -> Array:
 
 def _birge(chi2: float, dof: int) -> tuple[float, float]:
     """Return the Birge ratio and its degrees of freedom if it is improbably large, else 1 and infinity."""
-    if dof == 0 or chi2 <= stats.chi2.isf(RESCALE_BELOW, dof):
+    if dof == 0 or chi2 <= chi_square(RESCALE_BELOW, dof):
         return 1.0, math.inf
     return math.sqrt(chi2 / dof), float(dof)
 
