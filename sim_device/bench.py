@@ -38,6 +38,8 @@ class Device(Protocol):
     def session(self) -> int:
         """Number of the open session, 0 if none."""
 
+    testing: bool  #: whether a self-test is under way
+
     def feed(self, data: bytes, now_us: int) -> None:
         """Take what came over the line."""
 

@@ -94,6 +94,8 @@ class Pace:
             return None
         hosted = [line for line in self._bench.lines if line.device.session]
         due = min((line.due_us for line in hosted if line.due_us is not None), default=None)
+        if any(line.device.testing for line in hosted):
+            return due  # the host waits for the outcome, and may not listen to the other device meanwhile
         return due if due is not None and all(due <= self._horizon_us(line) for line in hosted) else None
 
     def _horizon_us(self, line: Line) -> float:

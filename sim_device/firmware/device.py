@@ -23,7 +23,7 @@ class Device:
         self._fed_us = 0
         self._test_due_us = 0
         self._test_request = 0  # number of the SELF_TEST that runs
-        self._testing = False
+        self.testing = False  # whether a self-test is under way
 
     @property
     def session(self) -> int:
@@ -49,7 +49,7 @@ class Device:
                 continue
             kind, payload = request
             if kind == HELLO:
-                self._testing = False
+                self.testing = False
                 self._reset(now_us)
             else:
                 reply = self._execute(kind, payload, now_us)
@@ -73,19 +73,19 @@ class Device:
         raise NotImplementedError
 
     def _start_self_test(self, _payload: bytes, now_us: int) -> "tuple[int, bytes] | None":
-        reason = NOT_READY if self._testing else self._at_work()
+        reason = NOT_READY if self.testing else self._at_work()
         if reason:
             return error(reason)
-        self._testing = True
+        self.testing = True
         self._test_request = self._session.request_id
         self._test_due_us = now_us + self._board.self_test_us()
         return None
 
     def _finish_self_test(self, now_us: int) -> None:
         """Answer the SELF_TEST that is done by now, if the host still waits for it."""
-        if not self._testing or self._test_due_us > now_us:
+        if not self.testing or self._test_due_us > now_us:
             return
-        self._testing = False
+        self.testing = False
         failures = self._board.self_test()
         if self._test_request == self._session.request_id:
             self._session.answer((SELF_TEST_RESULT, struct.pack("<H", failures)))
@@ -94,4 +94,4 @@ class Device:
         """Return when there will be a reply to send, None if none is under way."""
         if self._session.n_waiting:
             return self._fed_us
-        return self._test_due_us if self._testing else None
+        return self._test_due_us if self.testing else None

@@ -98,7 +98,7 @@ class GyroDevice(Device):
         return ACK  # a gyro latches none
 
     def _start_stream(self, _payload: bytes, now_us: int) -> "tuple[int, bytes] | None":
-        if self._testing:
+        if self.testing:
             return error(NOT_READY)
         if not self._streaming:
             self._board.start_sampling(now_us)

@@ -206,7 +206,7 @@ class StageDevice(Device):
             return error(FAULT_LATCHED, self._fault)
         if self._in_motion or self._suspected_us >= 0:
             return error(MOVING)
-        return error(NOT_READY) if self._testing else None
+        return error(NOT_READY) if self.testing else None
 
     def _path_refusal(self, targets: tuple[int, ...], speeds: tuple[int, ...]) -> "tuple[int, bytes] | None":
         """Return why the stage may not go to these targets at these speeds, None if it may."""
@@ -244,7 +244,7 @@ class StageDevice(Device):
         due = min(self._tick_due_us, self._watchdog_due_us())
         if self._session.number:
             due = min(due, self._status_due_us)
-        return min(due, self._test_due_us) if self._testing else due
+        return min(due, self._test_due_us) if self.testing else due
 
     def _watchdog_due_us(self) -> int:
         """Return when the watchdog trips: never before the next control tick if the stage is not on its way."""
