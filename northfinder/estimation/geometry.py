@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from northfinder.units import EARTH_RATE
 
@@ -37,11 +36,28 @@ def sensitivity(azimuth: ArrayLike, elevation: ArrayLike, tilt: ArrayLike, *, n_
     -------
     (n, n_axes, 3) array
     """
-    azimuth, elevation, tilt = np.asarray(azimuth), np.asarray(elevation), np.asarray(tilt)
-    head = Rotation.from_euler("ZY", np.column_stack([azimuth, elevation]))
-    lean = Rotation.from_rotvec(np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))]))
-    axes = (lean * head).as_matrix()[:, :, :n_axes]
-    return np.asarray(np.swapaxes(axes, 1, 2) * _TO_NEV)
+    azimuth, elevation, tilt = (np.asarray(angle, dtype=np.float64) for angle in (azimuth, elevation, tilt))
+    axes = np.stack(_head_axes(azimuth, elevation)[:n_axes], axis=1)
+    lean = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
+    return np.asarray(_turned(axes, lean) * _TO_NEV)
+
+
+def _head_axes(azimuth: Array, elevation: Array) -> list[Array]:
+    """Return the axes forward, right and down of the stage's head on a level pedestal, each (n, 3)."""
+    sin_a, cos_a, sin_e, cos_e = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
+    forward = np.column_stack([cos_e * cos_a, cos_e * sin_a, -sin_e])
+    right = np.column_stack([-sin_a, cos_a, np.zeros(azimuth.size)])
+    return [forward, right, np.cross(forward, right)]
+
+
+def _turned(axes: Array, rotation: Array) -> Array:
+    """Return `axes`, (n, n_axes, 3), turned by the rotation vectors, (n, 3): Rodrigues' formula."""
+    angle = np.linalg.norm(rotation, axis=1)[:, np.newaxis, np.newaxis]
+    vector = rotation[:, np.newaxis, :]
+    across = np.cross(vector, axes)
+    # np.sinc(x) is sin(pi x)/(pi x), so both factors are right for no rotation at all.
+    sine, versine = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(axes + sine * across + versine * np.cross(vector, across))
 
 
 def rates(azimuth: float, latitude: float, scale_factor: float = 1.0) -> Array:
