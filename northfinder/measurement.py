@@ -13,7 +13,7 @@ from northfinder.estimation import Fix
 from northfinder.record import DwellSpan, Recorder
 from northfinder.reduction import Reduction
 from northfinder.sequencer import Plan, Progress, Sequencer
-from northfinder.solution import Assumptions, fix_to_json, solve
+from northfinder.solution import Assumptions, before_offset, fix_to_json, solve, supplement
 
 
 class Watcher(Protocol):
@@ -45,15 +45,20 @@ class Outcome:
     n_samples: int
     n_lost: int
     duration: float  #: s from the first to the last sample
+    supplement: Mapping[str, Any] = field(default_factory=dict)  #: reported beside the fix: budget, calibration
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data, in the units of the field."""
-        return fix_to_json(self.fix) | {
-            "n_samples": self.n_samples,
-            "n_lost": self.n_lost,
-            "duration_s": round(self.duration, 6),
-            "record": str(self.record),
-        }
+        return (
+            fix_to_json(self.fix)
+            | dict(self.supplement)
+            | {
+                "n_samples": self.n_samples,
+                "n_lost": self.n_lost,
+                "duration_s": round(self.duration, 6),
+                "record": str(self.record),
+            }
+        )
 
 
 def measure(
@@ -85,13 +90,15 @@ def measure(
             stop_requested=stop_requested,
         )
         sequencer.run()
-        fix = solve(observer.reduction.means(), measurement.assumptions)
+        means = observer.reduction.means()
+        fix = solve(means, measurement.assumptions)
         outcome = Outcome(
             fix=fix,
             record=measurement.record,
             n_samples=recorder.n_samples,
             n_lost=recorder.n_lost,
             duration=sequencer.duration,
+            supplement=supplement(means, measurement.assumptions, fix),
         )
         recorder.add_fix(outcome.to_json())
     return outcome
@@ -111,10 +118,11 @@ class _Observer:
         self.watcher.show(progress, self.fix)
 
     def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> Fix | None:
-        """Reduce the dwell, and estimate as soon as that is possible."""
+        """Reduce the dwell, and estimate as soon as that is possible: for the plan, where stage azimuth zero points."""
         self.reduction.add(span, blocks)
         try:
             self.fix = solve(self.reduction.means(), self.assumptions)
         except EstimateError:
             self.fix = None  # too early to tell
-        return self.fix
+            return None
+        return before_offset(self.fix, self.assumptions)

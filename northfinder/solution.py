@@ -177,6 +177,11 @@ def solve(means: RateMeans, assumptions: Assumptions) -> Fix:
     )
 
 
+def before_offset(fix: Fix, assumptions: Assumptions) -> Fix:
+    """Return a fix of `solve` with the azimuth of stage azimuth zero again, the calibrated offset put back."""
+    return replace(fix, azimuth=wrapped(fix.azimuth + assumptions.declared().azimuth_offset))
+
+
 def _planes_estimated(problem: _Problem, known: Known, declared: Declared) -> Fix:
     """Return the estimator's fix, with the calibrated ratio of the two planes if there is one."""
     if declared.ratio == 1.0 and declared.ratio_sd == 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from northfinder.estimation.double_gyrocompass import solve_triad
 from northfinder.estimation.dwell_table import solve_dwell_table
 from northfinder.estimation.triad import static_mean
 from northfinder.record import Record
+from northfinder.record_facts import gyro_identity, record_date
 from northfinder.reduction import reduce_record
-from northfinder.solution import Assumptions, fix_to_json, solve
+from northfinder.solution import Assumptions, fix_to_json, solve, supplement
 from northfinder.table_report import dwell_table_json, triad_json
 from northfinder.tables import DwellTable, StaticTriad, read_table, stated_input_axis_offset
 
@@ -22,7 +24,11 @@ _SQLITE = b"SQLite format 3\0"
 
 
 def solve_file(
-    path: Path, assumptions: Assumptions | None, *, input_axis_offset: float | None = None
+    path: Path,
+    assumptions: Assumptions | None,
+    *,
+    revise: Callable[[Assumptions], Assumptions] = lambda kept: kept,
+    input_axis_offset: float | None = None,
 ) -> dict[str, Any]:
     """Return the fix from a file of any kind.
 
@@ -32,6 +38,8 @@ def solve_file(
         Told apart by its content, not by its name.
     assumptions : Assumptions, optional
         In place of those kept in a record; for a table, its latitude is used.
+    revise : callable
+        What to change of those assumptions.
     input_axis_offset : float, optional
         For a table of dwells: where the input axis points at stage azimuth zero, rad. If not given, what the file
         states, or zero.
@@ -49,24 +57,34 @@ def solve_file(
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
     if is_record:
-        return solve_record(path, assumptions)
-    latitude_deg = None if assumptions is None else assumptions.latitude_deg
+        return solve_record(path, assumptions, revise=revise)
+    latitude_deg = revise(assumptions or Assumptions()).latitude_deg
     latitude = None if latitude_deg is None else math.radians(latitude_deg)
     return _solve_table(read_table(path), latitude, input_axis_offset)
 
 
-def solve_record(path: Path, assumptions: Assumptions | None = None) -> dict[str, Any]:
-    """Return the fix from a record, under its own assumptions unless others are given."""
+def solve_record(
+    path: Path,
+    assumptions: Assumptions | None = None,
+    *,
+    revise: Callable[[Assumptions], Assumptions] = lambda kept: kept,
+) -> dict[str, Any]:
+    """Return the fix from a record, under its own assumptions unless others are given.
+
+    Raises RecordError, EstimateError, and ConfigError if the calibration is not for this record.
+    """
     with Record(path) as record:
-        if assumptions is None:
-            assumptions = _kept_assumptions(record)
-        reduction = reduce_record(record)
-        fix = solve(reduction.means(), assumptions)
+        assumptions = revise(assumptions or kept_assumptions(record))
+        if assumptions.calibration is not None:
+            assumptions.calibration.check(gyro_identity(record), record_date(record))
+        means = reduce_record(record).means()
+        fix = solve(means, assumptions)
         plan = record.meta("plan") or {}
-    return fix_to_json(fix) | {"plan": plan.get("name"), "record": str(path)}
+    return fix_to_json(fix) | supplement(means, assumptions, fix) | {"plan": plan.get("name"), "record": str(path)}
 
 
-def _kept_assumptions(record: Record) -> Assumptions:
+def kept_assumptions(record: Record) -> Assumptions:
+    """Return the assumptions of the live run. Raises RecordError if they are not in the record."""
     try:
         return msgspec.convert(record.meta("assumptions"), Assumptions)
     except msgspec.ValidationError as error:

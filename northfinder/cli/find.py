@@ -21,6 +21,7 @@ from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import open_gyro, open_stage
 from drivers.transport.clock import SystemClock
 from northfinder.adaptive import Wishes, make_plan
+from northfinder.calibration import checked, read_calibration
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.options import estimation_options
@@ -80,6 +81,8 @@ def command(
     seed: int | None,
     speed: str,
     latitude_deg: float | None,
+    latitude_sd_deg: float,
+    calibration_file: Path | None,
     profile: str | None,
     g_drift_dph: float | None,
     method: Method,
@@ -109,11 +112,17 @@ def command(
         # The addresses follow once the emulator runs, which is only started for a command that is right otherwise.
         config = Config(gyro=GyroTable(address="", profile=sim_profile), stage=StageTable(address=""))
     wanted = config.measurement
+    today = datetime.now(UTC).date()
+    calibration = None if calibration_file is None else read_calibration(calibration_file)
+    if calibration is not None:
+        calibration.check(None, today)
     assumptions = Assumptions.gather(
         profile=profile or config.gyro.profile,
         latitude_deg=wanted.latitude_deg if latitude_deg is None else latitude_deg,
+        latitude_sd_deg=latitude_sd_deg,
         g_drift_dph=g_drift_dph,
         method=method,
+        calibration=calibration,
     )
     wishes = _wishes(
         wanted, plan=plan, time_s=time_s, until_sd_deg=until_sd_deg, azimuth_deg=azimuth_deg, dwell_s=dwell_s
@@ -125,7 +134,9 @@ def command(
         stop_requested = stack.enter_context(_stop_on_signal(clock))
         display = stack.enter_context(DisplayContext(clock, quiet=quiet))
         measurement = Measurement(
-            open_gyro=lambda: _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate),
+            open_gyro=lambda: checked(
+                _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate), calibration, today
+            ),
             open_stage=lambda: _opened(
                 open_stage, config.stage.address, clock, baudrate=config.stage.baudrate, limits=config.stage.limits()
             ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import click
@@ -22,6 +23,21 @@ def estimation_options(command: Command) -> Command:
             type=click.FloatRange(-90, 90),
             metavar="DEG",
             help="Latitude, if known; else it is measured where the plan allows.",
+        ),
+        click.option(
+            "--latitude-sd",
+            "latitude_sd_deg",
+            type=click.FloatRange(min=0),
+            default=0.0,
+            metavar="DEG",
+            help="Standard deviation of the latitude given.",
+        ),
+        click.option(
+            "--calibration",
+            "calibration_file",
+            type=click.Path(path_type=Path),
+            metavar="FILE",
+            help="Constants from northfinder calibrate, instead of the profile's.",
         ),
         click.option("--profile", metavar="NAME|FILE", help="Gyro profile: noise and constants."),
         click.option(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
 
+from northfinder.budget_report import largest
 from northfinder.errors import EstimateError
 from northfinder.text import printable
 
@@ -34,12 +35,8 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     table.add_row("bias", f"{result['bias_dph']:.3f} deg/h" if isinstance(result["bias_dph"], float) else "")
     if result["scale_factor"] is not None:
         table.add_row("scale factor", f"{result['scale_factor']:.4f} ± {result['scale_factor_sd']:.4f}")
-    if result["n_rejected"]:
-        table.add_row("left out", f"{result['n_rejected']} disturbed seconds")
-    if result["rescaled_by"] > 1:
-        table.add_row(
-            "widened", f"the residuals do not fit the profile: the ± are {result['rescaled_by']:.2f} times its"
-        )
+    for row in _notes(result):
+        table.add_row(*row)
     for check in result["checks"]:
         mark = "[green]pass[/green]" if check["passed"] else "[red]FAIL[/red]"
         table.add_row(mark, printable(check["sentence"]))
@@ -48,6 +45,19 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     if "record" in result:
         table.add_row("record", printable(result["record"]))
     Console().print(Panel(table, title="true north", expand=False))
+
+
+def _notes(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what there is to say of how the fix came about."""
+    if result["n_rejected"]:
+        yield "left out", f"{result['n_rejected']} disturbed seconds"
+    if result["rescaled_by"] > 1:
+        yield "widened", f"the residuals do not fit the profile: the ± are {result['rescaled_by']:.2f} times its"
+    if "budget" in result:
+        yield "uncertainty", f"of the azimuth, the largest parts: {largest(result['budget'])} deg"
+    if "calibration" in result:
+        applied = result["calibration"]
+        yield "calibration", f"of {applied['date']}, valid until {applied['valid_until']}: {applied['model']}"
 
 
 def require_trustworthy(result: Mapping[str, Any]) -> None:

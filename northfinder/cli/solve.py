@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,17 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from northfinder.calibration import read_calibration
 from northfinder.cli.options import estimation_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.solution import Assumptions, Method
 from northfinder.solve_file import solve_file
 from northfinder.text import printable
+
+#: Options, and which of the assumptions that a record holds each of them changes.
+_REVISED = {name: name for name in ("latitude_deg", "latitude_sd_deg", "profile", "g_drift_dph", "method")} | {
+    "calibration_file": "calibration"
+}
 
 
 @click.command("solve")
@@ -34,6 +41,8 @@ def command(
     file: Path,
     offset_deg: float | None,
     latitude_deg: float | None,
+    latitude_sd_deg: float,
+    calibration_file: Path | None,
     profile: str | None,
     g_drift_dph: float | None,
     method: Method,
@@ -41,18 +50,29 @@ def command(
 ) -> None:
     """Estimate from FILE: a record of find, or CSV with a table of dwells or a static triad.
 
-    A record is solved under its own assumptions, and gives the fix of the live run again, unless options say otherwise.
+    A record is solved under its own assumptions and gives the fix of the live run again; each option changes one.
 
     \b
       northfinder solve records/north-20260101T120000.000000Z.sqlite
       northfinder solve dwells.csv --latitude 49 --input-axis-offset 180
       northfinder solve triad.csv --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
-    given = {name: context.get_parameter_source(name) for name in ("latitude_deg", "profile", "g_drift_dph", "method")}
-    own = all(source is click.core.ParameterSource.DEFAULT for source in given.values())
-    assumptions = Assumptions.gather(profile=profile, latitude_deg=latitude_deg, g_drift_dph=g_drift_dph, method=method)
+    options = Assumptions.gather(
+        profile=profile,
+        latitude_deg=latitude_deg,
+        latitude_sd_deg=latitude_sd_deg,
+        g_drift_dph=g_drift_dph,
+        method=method,
+        calibration=None if calibration_file is None else read_calibration(calibration_file),
+    )
+    sources = {option: context.get_parameter_source(option) for option in _REVISED}
+    changes = {
+        _REVISED[option]: getattr(options, _REVISED[option])
+        for option, source in sources.items()
+        if source is not click.core.ParameterSource.DEFAULT
+    }
     offset = None if offset_deg is None else math.radians(offset_deg)
-    result = solve_file(file, None if own else assumptions, input_axis_offset=offset)
+    result = solve_file(file, None, revise=lambda kept: replace(kept, **changes), input_axis_offset=offset)
     if as_json:
         print_json(result)
     elif "checks" in result:

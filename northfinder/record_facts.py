@@ -1,0 +1,63 @@
+"""What a record tells of itself beside its rates: which gyro, when, how warm."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import dataclass
+
+import msgspec
+
+from drivers.api import DeviceIdentity
+from northfinder.errors import RecordError
+from northfinder.record import Record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordFacts:
+    """Where a record comes from."""
+
+    gyro: DeviceIdentity | None  #: None if the measurement ended before it was known
+    started: float  #: s since 1970, UTC
+    ended: float  #: likewise
+    temperatures: tuple[float, float] | None  #: lowest and highest, degrees Celsius; None if none was measured
+
+    @property
+    def date(self) -> dt.date:
+        """Day of the measurement, UTC."""
+        return dt.datetime.fromtimestamp(self.ended, dt.UTC).date()
+
+
+def facts_of(record: Record) -> RecordFacts:
+    """Return what `record` tells of itself. Raises RecordError."""
+    started, ended = _times(record)
+    warm = [block.temperature for block in record.blocks() if block.temperature is not None]
+    return RecordFacts(
+        gyro=gyro_identity(record),
+        started=started,
+        ended=ended,
+        temperatures=(min(warm), max(warm)) if warm else None,
+    )
+
+
+def gyro_identity(record: Record) -> DeviceIdentity | None:
+    """Return who the gyro said it was, None if the record does not hold it. Raises RecordError."""
+    identities = record.meta("identities")
+    if identities is None:
+        return None
+    try:
+        return msgspec.convert(identities, dict[str, DeviceIdentity]).get("gyro")
+    except msgspec.ValidationError as error:
+        raise RecordError(f"the record {record.path} is damaged: its identities cannot be read: {error}") from None
+
+
+def record_date(record: Record) -> dt.date:
+    """Return the day on which the record ended, UTC. Raises RecordError if it holds no event."""
+    return dt.datetime.fromtimestamp(_times(record)[1], dt.UTC).date()
+
+
+def _times(record: Record) -> tuple[float, float]:
+    """Return when the first and the last event were, s since 1970."""
+    events = record.events()
+    if not events:
+        raise RecordError(f"the record {record.path} holds no event, so it has no date")
+    return events[0][0], events[-1][0]
