@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from drivers.api import StageLimits
 from northfinder.cyclogram import BUILT_IN, Cyclogram, Standing, Step, find_cyclogram
@@ -134,6 +135,8 @@ def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> Ada
 
 
 def _check_wishes(name: str, wishes: Wishes, *, searchable: bool) -> None:
+    if name not in PLANS and not Path(name).exists():
+        raise ConfigError(f"no plan {name!r}: expected {', '.join(PLANS)}, or a TOML file of a cyclogram")
     if wishes.dwell is not None and wishes.time is not None:
         raise ConfigError("a dwell and a time cannot both be given: the time says how long the dwells are")
     if name == "double" and wishes.azimuth is None:
