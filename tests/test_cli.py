@@ -189,7 +189,7 @@ def talking_port(answer: bytes) -> Iterator[str]:
 def identity(*, version: int) -> bytes:
     """Return the refusing answer to HELLO of a gyro of another protocol version."""
     body = struct.pack("<BHIIBIQ16s16s8s", 0x81, version, 0x12345678, 0, 1, 7, 1_000_000, b"tvg43", b"A1", b"2.0")
-    return cobs.encode(body + struct.pack("<I", fastcrc.crc32.iscsi(body))) + b"\0"
+    return bytes(cobs.encode(body + struct.pack("<I", fastcrc.crc32.iscsi(body)))) + b"\0"
 
 
 STRANGERS = [
