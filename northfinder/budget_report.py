@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.table import Table
 
 from northfinder.estimation.budget import Budget, Contribution
@@ -22,6 +23,7 @@ _FIELD_UNITS = {
     "1": (1.0, ""),
 }
 _DEGREES = {"latitude entry", "azimuth offset"}
+_NOTHING = 1e-9  # deg
 _ANGLE_WHITE_NOISE = "deg/h·s"  # an arc second by another name
 
 
@@ -50,19 +52,24 @@ def _line_to_json(line: Contribution) -> dict[str, Any]:
 
 
 def budget_table(lines: Sequence[Mapping[str, Any]], *, title: str = "") -> Table:
-    """Return the whole budget as `budget_to_json` gave it, with the combined standard uncertainties below."""
-    table = Table(title=title, show_footer=True)
-    table.add_column("quantity", footer="combined")
-    table.add_column("standard uncertainty", justify="right")
+    """Return the budget as `budget_to_json` gave it, with the combined standard uncertainties below."""
+    silent = ", ".join(line["quantity"] for line in lines if not line["sd"])
+    table = Table(title=title, show_footer=True, caption=f"taken as exact: {silent}" if silent else None, box=SIMPLE)
+    table.add_column("quantity", footer="combined", no_wrap=True)
+    table.add_column("sd", justify="right", no_wrap=True)
     table.add_column("type")
-    for name in ("azimuth", "latitude"):
-        total = math.hypot(*(line[f"{name}_deg"] for line in lines))
-        table.add_column(f"{name}, deg", justify="right", footer=f"{total:.4f}" if total else "")
+    for name in ("azimuth_deg", "latitude_deg"):
+        table.add_column(name.replace("_", ", "), justify="right", footer=_shown(math.hypot(*(x[name] for x in lines))))
     for line in lines:
-        shown = (f"{line[name]:.4f}" if line[name] else "" for name in ("azimuth_deg", "latitude_deg"))
-        sd = f"{line['sd']:.3g} {line['unit']}" if line["sd"] else "not declared"
-        table.add_row(line["quantity"], sd, line["evaluation"], *shown)
+        if line["sd"]:
+            sd = f"{line['sd']:.3g} {line['unit']}"
+            shown = (_shown(line[name]) for name in ("azimuth_deg", "latitude_deg"))
+            table.add_row(line["quantity"], sd, line["evaluation"], *shown)
     return table
+
+
+def _shown(angle_deg: float) -> str:
+    return f"{angle_deg:.4f}" if angle_deg > _NOTHING else ""
 
 
 def largest(lines: Sequence[Mapping[str, Any]], n: int = 3) -> str:
@@ -71,4 +78,5 @@ def largest(lines: Sequence[Mapping[str, Any]], n: int = 3) -> str:
     >>> largest([{"quantity": "bias instability", "azimuth_deg": 0.12}, {"quantity": "tilt", "azimuth_deg": 0.0}])
     'bias instability 0.120'
     """
-    return ", ".join(f"{line['quantity']} {line['azimuth_deg']:.3f}" for line in lines[:n] if line["azimuth_deg"])
+    felt = (line for line in lines[:n] if line["azimuth_deg"] > _NOTHING)
+    return ", ".join(f"{line['quantity']} {line['azimuth_deg']:.3f}" for line in felt)

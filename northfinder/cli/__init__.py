@@ -21,6 +21,7 @@ EXIT_INTERRUPTED = 130
 _COMMANDS = {
     "find": "Measure the true azimuth and the latitude.",
     "plan": "Predict what each plan gives in a given time.",
+    "budget": "Predict what a fix will owe its uncertainty to.",
     "solve": "Estimate again from a record, or from a table of measurements.",
     "allan": "Identify a gyro's noise from a recording at rest.",
     "emulate": "Serve an emulated gyro and stage.",
