@@ -13,6 +13,7 @@ from northfinder.errors import ConfigError, SequenceError
 from northfinder.estimation.planning import Prediction, Truth
 from northfinder.layouts import MEASURE_LATITUDE, PLANS
 from northfinder.plans import Conditions, candidates, filled, following_turns, time_of_turns
+from northfinder.reduction import MEAN_INTERVAL
 from northfinder.solution import Assumptions
 from northfinder.turns import Turns
 
@@ -80,7 +81,8 @@ class AdaptivePlan:
             turning = time_of_turns(steps, designed.turns, standing.azimuth, standing.elevation)
             factor = (self.time - standing.elapsed - turning) / sum(step.dwell for step in steps)
             if factor >= _LEAST_FACTOR:
-                return replace(steps[0], dwell=factor * steps[0].dwell)
+                dwell = _whole_means(factor * steps[0].dwell, last=len(steps) == 1)
+                return replace(steps[0], dwell=dwell, deadline=self.time)
             steps.pop()
         return None
 
@@ -104,6 +106,12 @@ class AdaptivePlan:
         if self._designed is None:
             raise SequenceError(f"the plan {self.name} was asked for a step before it knew the stage")
         return self._designed
+
+
+def _whole_means(dwell: float, *, last: bool) -> float:
+    """Return `dwell` as so many whole means, at least one; the last one of a plan may not grow."""
+    n = dwell / MEAN_INTERVAL
+    return MEAN_INTERVAL * max(1, math.floor(n + 1e-6) if last else round(n))
 
 
 def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> AdaptivePlan:

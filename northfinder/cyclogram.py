@@ -25,6 +25,7 @@ class Step:
     elevation: float  #: rad
     dwell: float  #: s of samples to use
     from_north: bool = False  #: whether the azimuth is a true one, to be turned to the stage's by the running estimate
+    deadline: float | None = None  #: s since the first slew began; the dwell ends by then, however late it began
 
     def __post_init__(self) -> None:
         """Check what a stage and an estimator will rely on."""

@@ -259,7 +259,11 @@ class Sequencer:
     def _dwell(self) -> Event:
         step = self._present_step()
         first = self._next_index
-        stop = first + max(1, round(step.dwell * self._devices()[0].sample_rate))
+        rate = self._devices()[0].sample_rate
+        stop = first + round(step.dwell * rate)
+        if step.deadline is not None:
+            stop = min(stop, math.floor(step.deadline * rate))
+        stop = max(stop, first + 1)
         self._blocks = []
         states: list[StageState] = [self._service_stage()]
 
@@ -281,7 +285,7 @@ class Sequencer:
             measured_elevation=math.fsum(state.elevation for state in states) / len(states),
             first_index=first,
             stop_index=stop,
-            sample_rate=self._devices()[0].sample_rate,
+            sample_rate=rate,
         )
         self.spans.append(span)
         self.recorder.add_step(span)

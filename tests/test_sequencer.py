@@ -93,6 +93,19 @@ def test_no_sample_of_a_slew_enters_a_dwell(tmp_path: Path) -> None:
         assert not [time for time in moving if first - 0.49 <= time < last - 0.001]
 
 
+def test_a_dwell_ends_by_its_deadline(tmp_path: Path) -> None:
+    """However late a dwell begins, it takes no sample beyond its deadline; one already past still takes one sample."""
+    steps = (
+        Step(name="U2", azimuth=math.radians(90), elevation=0.0, dwell=20.0, deadline=15.0),
+        Step(name="U2", azimuth=math.radians(90), elevation=0.0, dwell=20.0, deadline=15.0),
+    )
+    with sequencer(virtual_bench(), tmp_path / "r.sqlite", plan=Cyclogram(name="late", steps=steps)) as sequence:
+        spans = sequence.run()
+    assert spans[0].stop_index == 15 * 235
+    assert spans[0].stop_index - spans[0].first_index > 235
+    assert spans[1].stop_index - spans[1].first_index == 1
+
+
 def test_countdown_and_progress(tmp_path: Path) -> None:
     """What is still to come falls to nothing, and the rate shown is that of the newest block."""
     noted = Noted()
