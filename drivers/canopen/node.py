@@ -1,0 +1,313 @@
+"""One CANopen node as the drivers see it: objects read and written, PDOs collected, its life watched.
+
+Nothing here waits but `read`, `write`, `wait` and what is built on them. `service` sorts what has arrived; whatever a
+frame holds, it raises nothing but DeviceError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import canopen
+from canopen.emcy import EmcyError
+from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary.datatypes import SIGNED_TYPES
+from canopen.objectdictionary.eds import import_eds
+from canopen.sdo import SdoAbortedError, SdoCommunicationError
+
+from drivers.api import Clock, FrameLink
+from drivers.canopen.network import SDO_TIMEOUT, LinkNetwork, LinkNode, SilenceError
+from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
+
+EDS_FOLDER = Path(__file__).parent.parent / "eds"
+HEARTBEAT_MS = 50  #: of a node, as the drivers ask for it
+MAX_SILENCE = 0.25  # s without a heartbeat; found within 300 ms by a host that looks each 50 ms
+LONGEST_LOOK = 0.1  # s; a host that was away for longer has not listened for longer
+SERVICE_PERIOD = 0.05  # s, how often a wait looks after the other duties
+MAX_WAITING = 4096  # frames of one PDO that wait for the driver
+OPERATIONAL = 5
+PRE_OPERATIONAL = 127
+T = TypeVar("T")
+_ATTEMPTS = 3
+_STATE_TIMEOUT = 1.0  # s
+_TWIN_TIME = 0.02  # s in which a second node of the same number would answer
+_IDENTITY = 0x1018
+#: Abort codes by which a device refuses what host and device both understand.
+_REFUSALS = {0x06060000, 0x06090030, 0x06090031, 0x06090032, 0x08000020, 0x08000021, 0x08000022}
+_MISSING = {0x06020000, 0x06090011}
+
+
+class MissingObjectError(ProtocolError):
+    """The device has no such object."""
+
+
+def load_dictionary(name: str, node_id: int) -> canopen.ObjectDictionary:
+    """Return the object dictionary of one of the EDS files shipped, for a node."""
+    dictionary: canopen.ObjectDictionary = import_eds(EDS_FOLDER / name, node_id)
+    dictionary.node_id = node_id
+    return dictionary
+
+
+class Node:
+    """A node on a bus.
+
+    Parameters
+    ----------
+    link
+        To the bus; the node closes it.
+    clock
+        The clock that `link` notifies.
+    dictionary
+        The node's object dictionary; it holds the node's number.
+    title
+        What it is, for messages: ``gyro``.
+    """
+
+    def __init__(self, link: FrameLink, clock: Clock, dictionary: canopen.ObjectDictionary, *, title: str) -> None:
+        self.id = dictionary.node_id or 0
+        self.remote = LinkNode(self.id, dictionary, clock, self.wait)
+        self.duty: Callable[[], None] = lambda: None  #: done before each look at what has arrived, for heartbeats
+        self.emergencies: list[EmcyError] = []  #: that the driver has not yet taken
+        self.state = -1  #: NMT state in the last heartbeat, -1 if none has come
+        self.was_reset = False  #: whether it has sent a boot-up message since `watch`
+        self.n_malformed = 0
+        self._title = title
+        self._link = link
+        self._clock = clock
+        self._network = LinkNetwork(link)
+        self._network.add_node(self.remote)
+        self._pdos: dict[int, list[bytes]] = {}
+        self._silence = 0.0
+        self._looked_at = clock.now()
+        self._watched = False
+        self.remote.nmt.add_heartbeat_callback(self._on_heartbeat)
+        self.remote.emcy.add_callback(self._on_emergency)
+        self._lengths = {0x80 + self.id: 8, 0x580 + self.id: 8, 0x700 + self.id: 1}
+
+    @property
+    def name(self) -> str:
+        """Device, number and bus, for messages: ``the gyro, node 16 on socketcan:can0``."""
+        return f"the {self._title}, node {self.id} on {self._link.name}"
+
+    # What arrives
+
+    def service(self) -> None:
+        """Do the other duty, and sort what has arrived. Never waits."""
+        self.duty()
+        now = self._clock.now()
+        self._silence += min(now - self._looked_at, LONGEST_LOOK)
+        self._looked_at = now
+        for identifier, data in self._link.receive():
+            waiting = self._pdos.get(identifier)
+            if waiting is not None:
+                if len(waiting) < MAX_WAITING:
+                    waiting.append(data)
+            elif self._lengths.get(identifier) == len(data):
+                self._network.notify(identifier, bytearray(data), now)
+            else:
+                self.n_malformed += 1
+
+    def wait(self, deadline: float) -> None:
+        """Service until something has come, or `deadline`, or a service period has gone by."""
+        self.service()
+        now = self._clock.now()
+        if self.remote.sdo.responses.empty() and now < deadline:
+            self._clock.wait(min(deadline, now + SERVICE_PERIOD))
+            self.service()
+
+    def collect(self, *cob_ids: int) -> None:
+        """Keep the PDOs of these identifiers for `take`, from now on."""
+        for cob_id in cob_ids:
+            self._pdos[cob_id] = []
+
+    def take(self, cob_id: int) -> list[bytes]:
+        """Return the PDOs of an identifier that have come, oldest first."""
+        waiting = self._pdos[cob_id]
+        self._pdos[cob_id] = []
+        return waiting
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send a frame."""
+        self._link.send(identifier, data)
+
+    def close(self) -> None:
+        """Release the link."""
+        self._watched = False
+        self._link.close()
+
+    # Life
+
+    def watch(self) -> None:
+        """Count the silence from now, and take each boot-up message as a reset."""
+        self._silence, self._watched, self.was_reset = 0.0, True, False
+
+    def check_alive(self) -> None:
+        """Raise if the node was reset, or its heartbeat has stopped, since `watch`.
+
+        Raises
+        ------
+        DeviceFaultError
+            If it was reset, or has left OPERATIONAL.
+        DeviceTimeoutError
+            If no heartbeat has come for 250 ms.
+        """
+        if not self._watched:
+            return
+        if self.was_reset:
+            raise DeviceFaultError(f"{self.name} was reset: it has sent its boot-up message; connect again")
+        if self._silence > MAX_SILENCE:
+            raise DeviceTimeoutError(
+                f"{self.name} has sent no heartbeat for {self._silence * 1000:.0f} ms: was it cut off?"
+            )
+        if self.state != OPERATIONAL:
+            raise DeviceFaultError(f"{self.name} has left OPERATIONAL: another host commands it")
+
+    def command(self, state: str, code: int) -> None:
+        """Command an NMT state by canopen's name for it, and wait until a heartbeat tells it.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            If the node does not go there.
+        """
+        self.state = -1
+        self.remote.nmt.state = state
+        deadline = self._clock.now() + _STATE_TIMEOUT
+        while self.state != code:
+            if self._clock.now() >= deadline:
+                raise DeviceTimeoutError(f"{self.name} has not become {state} within {_STATE_TIMEOUT:g} s")
+            self.wait(deadline)
+
+    # Objects
+
+    def read(self, index: int, subindex: int = 0) -> int:
+        """Return the value of a number.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            If the node does not answer.
+        ProtocolError, DeviceFaultError
+            If it refuses, or answers with something else.
+        """
+        variable = self._variable(index, subindex)
+        data = self._transfer(f"reading {_called(variable)}", lambda: self.remote.sdo.upload(index, subindex))
+        if len(data) * 8 != len(variable):
+            raise ProtocolError(
+                f"{self.name} answered {len(data)} bytes for {_called(variable)}, {len(variable) // 8} were expected"
+            )
+        return int.from_bytes(data, "little", signed=variable.data_type in SIGNED_TYPES)
+
+    def default(self, index: int, subindex: int = 0) -> int:
+        """Return what the object dictionary says of a number's value at start, 0 if nothing."""
+        return self._variable(index, subindex).default or 0
+
+    def read_optional(self, index: int, subindex: int = 0) -> int | None:
+        """Return the value of a number, None if the node has no such object."""
+        try:
+            return self.read(index, subindex)
+        except MissingObjectError:
+            return None
+
+    def read_text(self, index: int) -> str:
+        """Return a text up to its padding, printable: what else there is becomes ``?``. Raises as `read`."""
+        variable = self._variable(index, 0)
+        data = self._transfer(f"reading {_called(variable)}", lambda: self.remote.sdo.upload(index, 0))
+        return "".join(chr(code) if 0x20 <= code < 0x7F else "?" for code in data.split(b"\0")[0])
+
+    def write(self, index: int, subindex: int, value: int, *, verify: bool = False) -> None:
+        """Write a number, and read it back if asked to. Raises as `read`; ProtocolError if it reads back otherwise."""
+        variable = self._variable(index, subindex)
+        signed = variable.data_type in SIGNED_TYPES
+        data = value.to_bytes(len(variable) // 8, "little", signed=signed)
+        what = f"writing {value} to {_called(variable)}"
+        self._transfer(what, lambda: self.remote.sdo.download(index, subindex, data))
+        if verify and (kept := self.read(index, subindex)) != value:
+            raise ProtocolError(f"{self.name} kept {kept} after {what}")
+
+    def greet(self) -> None:
+        """See that the node answers, and that it is the only one of its number.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            If nothing answers, with what was heard instead.
+        ProtocolError
+            If two nodes answer.
+        """
+        try:
+            serial_number = self.read(_IDENTITY, 4)
+        except DeviceTimeoutError:
+            raise self._unheard() from None
+        responses = self.remote.sdo.responses
+        deadline = self._clock.now() + _TWIN_TIME
+        while responses.empty() and self._clock.now() < deadline:
+            self.wait(deadline)
+        if not responses.empty():
+            second = int.from_bytes(responses.get_nowait()[4:8], "little")
+            raise ProtocolError(
+                f"two nodes answer as node {self.id} on {self._link.name}, with the serial numbers {serial_number} "
+                f"and {second}: give one of them another number"
+            )
+
+    def _transfer(self, what: str, transfer: Callable[[], T]) -> T:
+        """Run a transfer, up to three times if nothing answers; turn canopen's exceptions into ours."""
+        for _ in range(_ATTEMPTS):
+            self.remote.sdo.n_answers = 0
+            try:
+                return transfer()
+            except SilenceError:
+                continue
+            except SdoAbortedError as error:
+                raise self._refusal(what, error) from None
+            except SdoCommunicationError as error:
+                raise ProtocolError(f"{self.name} does not answer {what} as it should: {error}") from None
+        raise DeviceTimeoutError(f"{self.name} did not answer {what} within {_ATTEMPTS * SDO_TIMEOUT:.1f} s")
+
+    def _refusal(self, what: str, error: SdoAbortedError) -> DeviceError:
+        text = (
+            f"{self.name} refused {what}: {SdoAbortedError.CODES.get(error.code, 'unknown reason')} ({error.code:08X})"
+        )
+        if error.code in _MISSING:
+            return MissingObjectError(text)
+        return DeviceFaultError(text) if error.code in _REFUSALS else ProtocolError(text)
+
+    def _unheard(self) -> DeviceTimeoutError:
+        """Return the exception for a node that does not answer, with what was heard on the bus instead."""
+        counts = self._link.counts
+        nodes = sorted({identifier & 0x7F for identifier in counts.identifiers if identifier & 0x7F})
+        if counts.n_errors:
+            heard = f"{counts.n_errors} error frames came: is the bit rate right, and the cable whole?"
+        elif nodes:
+            heard = f"others speak there ({', '.join(map(str, nodes[:8]))}): has it this number, and power?"
+        else:
+            heard = "the bus is silent: is it powered, and is this its bit rate?"
+        return DeviceTimeoutError(f"{self.name} does not answer; {heard}")
+
+    def _variable(self, index: int, subindex: int) -> ODVariable:
+        variable = self.remote.object_dictionary.get_variable(index, subindex)
+        if variable is None:
+            raise ValueError(f"there is no object {index:04X}:{subindex} in the dictionary of {self.name}")
+        return variable
+
+    def _on_heartbeat(self, state: int) -> None:
+        """Take a heartbeat; state 0 is a boot-up message."""
+        self.state = state
+        self._silence = 0.0
+        self.was_reset = self.was_reset or state == 0
+
+    def _on_emergency(self, emergency: EmcyError) -> None:
+        """Take an EMCY; canopen's own lists would grow for ever."""
+        self.remote.emcy.reset()
+        if len(self.emergencies) < MAX_WAITING:
+            self.emergencies.append(emergency)
+
+
+def _called(variable: ODVariable) -> str:
+    """Return how an object is called, for messages: ``Boot count (2002)``."""
+    parent = variable.parent
+    if isinstance(parent, canopen.ObjectDictionary):
+        return f"{variable.name} ({variable.index:04X})"
+    return f"{variable.name} ({variable.index:04X}:{variable.subindex})"
