@@ -69,7 +69,7 @@ def port(request: pytest.FixtureRequest) -> Iterator[PtyGyro]:
 def test_a_gyro_streams_over_a_real_terminal(port: PtyGyro) -> None:
     """Opened by name, the emulated gyro connects, tests itself and streams over a pseudo-terminal; nothing is lost."""
     clock = SystemClock()
-    gyro = open_gyro(f"native:{port.path}", clock, block_samples=10)
+    gyro = open_gyro(f"native:{port.path}", clock, block_duration=10 / 235)
     assert isinstance(gyro, NativeGyro)
     assert gyro.connect().model == "tvg43"
     assert gyro.self_test().passed
