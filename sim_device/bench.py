@@ -1,8 +1,10 @@
-"""A whole bench in virtual time: plant, boards and firmware of both devices, on one clock.
+"""A whole bench in virtual time: plant, boards and firmware of the devices, on one clock.
 
-A `Line` is the host's end of one device's line, a function of time like the firmware itself: ``feed(data, now_us)``,
-``poll(now_us)``, ``next_due_us()``, all in world time. Whichever line is asked, the whole world is first brought to
-that instant in the order of what is due, so that the gyro always samples where the stage was.
+A `World` is the plant with the boards of both devices; `SimBench` runs the serial firmware on them, and
+`sim_device.can_bench` that of a CAN bus. A `Line` is the host's end of one device's serial line, a function of time
+like the firmware itself: ``feed(data, now_us)``, ``poll(now_us)``, ``next_due_us()``, all in world time. Whichever
+line is asked, the whole world is first brought to that instant in the order of what is due, so that the gyro always
+samples where the stage was.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -27,8 +29,8 @@ NOISE_BATCH = 8192  #: samples made at a time
 FIRST_BOOT = 1
 
 
-class Device(Protocol):
-    """What the firmware of either device offers, in the board's time."""
+class Hosted(Protocol):
+    """What the firmware of any device says of its host, and when it has something to do, in the board's time."""
 
     @property
     def seen_time_us(self) -> int:
@@ -38,7 +40,16 @@ class Device(Protocol):
     def session(self) -> int:
         """Number of the open session, 0 if none."""
 
-    testing: bool  #: whether a self-test is under way
+    @property
+    def testing(self) -> bool:
+        """Whether a self-test is under way."""
+
+    def next_due_us(self) -> int | None:
+        """Return when there will be something to do."""
+
+
+class Device(Hosted, Protocol):
+    """What the firmware of either device on a serial line offers, in the board's time."""
 
     def feed(self, data: bytes, now_us: int) -> None:
         """Take what came over the line."""
@@ -46,20 +57,44 @@ class Device(Protocol):
     def poll(self, now_us: int) -> bytes:
         """Do what is due and return what to send."""
 
-    def next_due_us(self) -> int | None:
-        """Return when there will be something to do."""
 
+class Seat:
+    """A device's place in the world: when it started, and when it will next do something."""
 
-class Line:
-    """The host's end of one device's line."""
-
-    def __init__(self, bench: SimBench, name: str, device: Device) -> None:
+    def __init__(self, bench: World, name: str, device: Hosted) -> None:
         self.bench = bench
-        self.name = name  #: "gyro" or "stage"
+        self.name = name  #: what an operator calls the device, "gyro" or "stage"
         self.device = device
         self.epoch_us = 0  #: world time of the device's start
-        self.room: int | None = None  #: bytes that the line can take now, None for any number; beyond, blocks are lost
         self.due_us = device.next_due_us()  #: when the device will next do something, in world time; None if never
+
+    @property
+    def told_us(self) -> int:
+        """Device time of the newest status of a stage that its host has to acknowledge, -1 if there is none."""
+        return -1
+
+    def serve(self) -> None:
+        """Let the device do what is due now."""
+        raise NotImplementedError
+
+    def restart(self, device: Hosted) -> None:
+        """Go on with a device that has just started."""
+        self.device = device
+        self.epoch_us = self.bench.now_us
+        self._note_due()
+
+    def _note_due(self) -> None:
+        due_us = self.device.next_due_us()
+        self.due_us = None if due_us is None else due_us + self.epoch_us
+
+
+class Line(Seat):
+    """The host's end of one device's line."""
+
+    def __init__(self, bench: World, name: str, device: Device) -> None:
+        super().__init__(bench, name, device)
+        self.device: Device = device
+        self.room: int | None = None  #: bytes that the line can take now, None for any number; beyond, blocks are lost
         self._out = bytearray()
 
     def feed(self, data: bytes, now_us: int) -> None:
@@ -98,20 +133,14 @@ class Line:
             self._out += sent
         self._note_due()
 
-    def restart(self, device: Device) -> None:
+    def restart(self, device: Hosted) -> None:
         """Go on with a device that has just started; what the old one had not yet sent is lost."""
-        self.device = device
-        self.epoch_us = self.bench.now_us
         self._out.clear()
-        self._note_due()
-
-    def _note_due(self) -> None:
-        due_us = self.device.next_due_us()
-        self.due_us = None if due_us is None else due_us + self.epoch_us
+        super().restart(device)
 
 
-class SimBench:
-    """An emulated gyro on an emulated stage.
+class World:
+    """An emulated gyro on an emulated stage, as plant and boards; what runs on the boards is a subclass' business.
 
     Parameters
     ----------
@@ -129,6 +158,9 @@ class SimBench:
         Of each gyro axis, instead of the profile's.
 
     """
+
+    gyro: Seat
+    lines: tuple[Seat, ...]  #: those of the stage first: the gyro samples where it then stands
 
     def __init__(
         self,
@@ -150,9 +182,6 @@ class SimBench:
         self._scheduled: list[tuple[int, int, Callable[[], None]]] = []
         self.stage_board = self._make_stage_board(FIRST_BOOT)
         self.gyro_board = self._make_gyro_board(FIRST_BOOT)
-        self.stage = Line(self, "stage", StageDevice(self.stage_board))
-        self.gyro = Line(self, "gyro", GyroDevice(self.gyro_board))
-        self.lines = (self.stage, self.gyro)  # the stage first: the gyro samples where it then stands
 
     def advance_to(self, now_us: int) -> None:
         """Let everything happen that is due up to `now_us`, in its order. An instant already past changes nothing."""
@@ -180,15 +209,18 @@ class SimBench:
         """Switch the device of that name ("gyro" or "stage") off and on, now."""
         if name == "gyro":
             self.gyro_board = self._make_gyro_board(self.gyro_board.boot_count + 1)
-            self.gyro.restart(GyroDevice(self.gyro_board))
         elif name == "stage":
             self.stage_board = self._make_stage_board(self.stage_board.boot_count + 1)
-            self.stage.restart(StageDevice(self.stage_board))
         else:
             raise ValueError(f"no device {name!r}: gyro or stage")
+        self._restart(name)
 
-    def _next_event(self) -> tuple[int, Line | None] | None:
-        found: tuple[int, Line | None] | None = (self._scheduled[0][0], None) if self._scheduled else None
+    def _restart(self, name: str) -> None:
+        """Start the firmware of a device on its new board."""
+        raise NotImplementedError
+
+    def _next_event(self) -> tuple[int, Seat | None] | None:
+        found: tuple[int, Seat | None] | None = (self._scheduled[0][0], None) if self._scheduled else None
         for line in self.lines:
             due = line.due_us
             if due is not None and (found is None or due < found[0]):
@@ -220,3 +252,22 @@ class SimBench:
             epoch_us=self.now_us,
             boot_count=boot_count,
         )
+
+
+class SimBench(World):
+    """The bench with its serial firmware, each device on a line of its own. Takes what `World` takes."""
+
+    gyro: Line
+    lines: tuple[Line, ...]
+
+    def __init__(self, profile: str | Profile = "tvg43", **options: Any) -> None:  # noqa: ANN401 - those of World
+        super().__init__(profile, **options)
+        self.stage = Line(self, "stage", StageDevice(self.stage_board))
+        self.gyro = Line(self, "gyro", GyroDevice(self.gyro_board))
+        self.lines = (self.stage, self.gyro)
+
+    def _restart(self, name: str) -> None:
+        if name == "gyro":
+            self.gyro.restart(GyroDevice(self.gyro_board))
+        else:
+            self.stage.restart(StageDevice(self.stage_board))

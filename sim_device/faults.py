@@ -30,7 +30,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sim_device.bench import Line, SimBench
+from sim_device.bench import Line, World
 from sim_device.plant.gyro import STREAM_FAULTS, seed_of
 from sim_device.plant.stage import Stage, StageAxis
 
@@ -192,7 +192,7 @@ def link_faults(specs: list[FaultSpec], device: str) -> LinkFaults:
     )
 
 
-def schedule(specs: list[FaultSpec], bench: SimBench) -> None:
+def schedule(specs: list[FaultSpec], bench: World) -> None:
     """Let the faults of devices and plant happen at their instants.
 
     Raises
@@ -210,7 +210,7 @@ def schedule(specs: list[FaultSpec], bench: SimBench) -> None:
             bench.at(spec.instant_us() + spec.duration_us, lambda: _press(bench.plant_stage, pressed=False))
 
 
-def _action(spec: FaultSpec, bench: SimBench) -> Callable[[], None]:
+def _action(spec: FaultSpec, bench: World) -> Callable[[], None]:
     if spec.name == "reset":
         return lambda: bench.reset(spec.device)
     if spec.device == "gyro" and spec.name == "sensor-fault":

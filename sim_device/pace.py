@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from sim_device.bench import Line, SimBench
+from sim_device.bench import Seat, World
 
 MOVING_PATIENCE_US = 50_000  #: wall time for which the world waits for the host while the stage moves
 REST_PATIENCE_US = 250_000  #: the same with the stage at rest
@@ -32,7 +32,7 @@ class Pace:
 
     """
 
-    def __init__(self, bench: SimBench, speed: float) -> None:
+    def __init__(self, bench: World, speed: float) -> None:
         if not speed >= 1:
             raise ValueError(f"the speed must be at least 1, got {speed:g}")
         self._bench = bench
@@ -98,7 +98,7 @@ class Pace:
             return due  # the host waits for the outcome, and may not listen to the other device meanwhile
         return due if due is not None and all(due <= self._horizon_us(line) for line in hosted) else None
 
-    def _horizon_us(self, line: Line) -> float:
+    def _horizon_us(self, line: Seat) -> float:
         """Return up to when a line's host lets the world run ahead."""
         seen_us = line.device.seen_time_us
         if line is self._bench.gyro:

@@ -16,7 +16,9 @@ _ARCSEC = 10
 _DEGREE = 36_000
 
 IN_POSITION = 30 * _ARCSEC  # the encoder this near the target of an ended profile
-_LAG = _DEGREE // 2  # between profile and encoder: the axis does not follow
+CREEP = _DEGREE // 100  # per second, of the last pass of homing
+FASTEST_CREEP = 3 * _DEGREE // 10
+LAG = _DEGREE // 2  # between profile and encoder: the axis does not follow
 _JUMP = _DEGREE // 10  # more than the axis can have moved
 _WRONG_WAY = _DEGREE // 10  # per second
 _STILL = 10 * _ARCSEC
@@ -97,7 +99,7 @@ class Axis:
     @property
     def lost(self) -> bool:
         """Whether the axis does not follow."""
-        return abs(self.lag) > _LAG
+        return abs(self.lag) > LAG
 
     @property
     def rate(self) -> int:
@@ -179,7 +181,15 @@ class Homing:
     """
 
     def __init__(
-        self, board: StageBoard, index: int, axis: Axis, farthest: int, speed: int, acceleration: int, now_us: int
+        self,
+        board: StageBoard,
+        index: int,
+        axis: Axis,
+        farthest: int,
+        speed: int,
+        acceleration: int,
+        now_us: int,
+        creep: int = CREEP,
     ) -> None:
         self.done = False
         self.failed = False
@@ -189,7 +199,7 @@ class Homing:
         self._axis = axis
         self._fast = speed
         self._acceleration = acceleration
-        self._speeds = [min(speed, slow) for slow in (speed, 3 * _DEGREE // 10, _DEGREE // 100)]  # of passes to do
+        self._speeds = [min(speed, slow) for slow in (speed, FASTEST_CREEP, creep)]  # of passes to do
         self._step = self._seek
         self._clearance = 0
         self._side = board.reference_side(index, now_us)
