@@ -3,8 +3,9 @@
 At 1x world time is wall time. Faster, the world never runs slower than that, and runs ahead only while the host keeps
 up: it goes from one thing that is due to the next, and holds as soon as a device has sent a stream frame that its host
 must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. So a run at full speed is a lockstep with the host. When
-the host stays away, time goes on at 1x from there: soon while the stage moves, so that a dead host trips its watchdog
-as it would in reality; later at rest, so that a host which is merely busy finds the same world again.
+the host stays away, time goes on at 1x from there, and a dead host trips the stage's watchdog as in reality: after a
+quarter of a second with the stage at rest, where a lost frame may be all there is to it; after a second while it moves,
+so that a host which is merely busy finds the same world again.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 
 from sim_device.bench import Seat, World
 
-MOVING_PATIENCE_US = 50_000  #: wall time for which the world waits for the host while the stage moves
+MOVING_PATIENCE_US = 1_000_000  #: wall time for which the world waits for the host while the stage moves
 REST_PATIENCE_US = 250_000  #: the same with the stage at rest
 MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little

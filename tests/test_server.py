@@ -236,7 +236,7 @@ def test_ten_times_real_time(start: Start) -> None:
         assert 0.8 < time.monotonic() - begin < 3.0
 
 
-@pytest.mark.parametrize("speed", ["20", "max"])
+@pytest.mark.parametrize("speed", ["1", "20", "max"])
 def test_killed_host_stops_the_stage(start: Start, speed: str) -> None:
     """The host is killed while the stage moves: within 300 ms its watchdog brings it to rest."""
     _, facts = start("--profile", "ideal", "--speed", speed)
@@ -253,7 +253,7 @@ def test_killed_host_stops_the_stage(start: Start, speed: str) -> None:
         while fault is None:
             found = [parse_status(body) for body in observer.receive() if body[0] == STAGE_STATUS]
             fault = next((status for status in found if status.state == FAULT), None)
-        assert time.monotonic() - killed < 1.0  # 0.35 s on a quiet machine
+        assert time.monotonic() - killed < (1.0 if speed == "1" else 3.0)  # 0.35 s, 1.35 s on a quiet machine
     assert fault.fault == 1
     # 300 ms after a heartbeat, which may have been sent up to one status later than what it acknowledged
     assert 0 < fault.time_us - acknowledged_us <= 420_000
