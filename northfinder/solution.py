@@ -127,8 +127,8 @@ class Assumptions:
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
-    """Means as they are used, and how."""
+class Problem:
+    """Means as the estimator is given them, and how they are weighted."""
 
     means: RateMeans
     noise: NoiseModel | None
@@ -137,7 +137,7 @@ class _Problem:
     n_rejected: int
 
     @classmethod
-    def of(cls, means: RateMeans, assumptions: Assumptions) -> _Problem:
+    def of(cls, means: RateMeans, assumptions: Assumptions) -> Problem:
         """With a noise model short means weighted by it; without one dwells that count alike and a bias that drifts."""
         noise = assumptions.noise()
         if assumptions.method == "generalised" and noise is not None:
@@ -163,7 +163,7 @@ def solve(means: RateMeans, assumptions: Assumptions) -> Fix:
     With a noise model the short means are weighted by it; without one the dwells count alike, the bias may drift, and
     the standard deviations come from the residuals. Declared uncertainties are added to those of the estimate.
     """
-    problem, known, declared = _Problem.of(means, assumptions), assumptions.known(), assumptions.declared()
+    problem, known, declared = Problem.of(means, assumptions), assumptions.known(), assumptions.declared()
     fix = _planes_estimated(problem, known, declared)
     added = declared_variance(
         problem.means, fix, noise=problem.noise, known=known, drift=problem.drift, weights=problem.weights,
@@ -182,7 +182,7 @@ def before_offset(fix: Fix, assumptions: Assumptions) -> Fix:
     return replace(fix, azimuth=wrapped(fix.azimuth + assumptions.declared().azimuth_offset))
 
 
-def _planes_estimated(problem: _Problem, known: Known, declared: Declared) -> Fix:
+def _planes_estimated(problem: Problem, known: Known, declared: Declared) -> Fix:
     """Return the estimator's fix, with the calibrated ratio of the two planes if there is one."""
     if declared.ratio == 1.0 and declared.ratio_sd == 0.0:
         return problem.estimate(known)
@@ -194,7 +194,7 @@ def _planes_estimated(problem: _Problem, known: Known, declared: Declared) -> Fi
 
 def supplement(means: RateMeans, assumptions: Assumptions, fix: Fix) -> dict[str, Any]:
     """Return what a report says beside the fix that `solve` gave: its uncertainty budget, the calibration applied."""
-    problem = _Problem.of(means, assumptions)
+    problem = Problem.of(means, assumptions)
     budget = error_budget(
         problem.means, fix, noise=problem.noise, known=assumptions.known(), drift=problem.drift,
         weights=problem.weights, declared=assumptions.declared(),
@@ -239,10 +239,10 @@ def _degrees(angle: float | None) -> float | None:
 
 def _check_to_json(check: Check) -> dict[str, object]:
     factor, unit = {"rad/s": (1 / DPH, "deg/h"), "rad": (math.degrees(1.0), "deg")}.get(check.unit, (1.0, ""))
-    figures = {name: getattr(check, name) * factor for name in ("value", "sd", "limit")}
+    figures = {name: float(getattr(check, name) * factor) for name in ("value", "sd", "limit")}
     return {
         "name": check.name,
-        "passed": check.passed,
+        "passed": bool(check.passed),
         "decisive": check.decisive,
         **figures,
         "unit": unit,

@@ -9,9 +9,12 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from virtual import virtual_bench
 
+from northfinder.calibration import read_calibration
 from northfinder.cli import cli
-from northfinder.errors import NorthFinderError
+from northfinder.cyclogram import six_position
+from northfinder.errors import ConfigError, NorthFinderError, RecordError
 
 
 def northfinder(*arguments: object) -> str:
@@ -27,6 +30,29 @@ def as_json(*arguments: object) -> dict[str, Any]:
     """Run a command and return its JSON."""
     found: dict[str, Any] = json.loads(northfinder(*arguments, "--json"))
     return found
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return records of one gyro: three at latitude 50.429 in two turn-ons, one at latitude 30."""
+    folder = tmp_path_factory.mktemp("records")
+    home, abroad = virtual_bench(seed=12), virtual_bench(seed=12, latitude_deg=30.0)
+    paths = [folder / f"{number}.sqlite" for number in range(4)]
+    for path in paths[:2]:
+        home.measure(path, six_position(20.0))
+    for bench in (home, abroad, abroad):  # so that each record has noise of its own
+        bench.bench.reset("gyro")
+    home.measure(paths[2], six_position(20.0))
+    abroad.measure(paths[3], six_position(20.0))
+    return paths
+
+
+@pytest.fixture
+def calibration(records: list[Path], tmp_path: Path) -> Path:
+    """Return the calibration from the records at 50.429, whose line lies 3 deg before stage azimuth zero."""
+    path = tmp_path / "gyro.toml"
+    northfinder("calibrate", *records[:3], "--latitude", 50.429, "--azimuth", 30.0, "--save", path)
+    return path
 
 
 def test_budget_tells_ahead_what_find_will_state(tmp_path: Path) -> None:
@@ -49,3 +75,78 @@ def test_budget_tells_ahead_what_find_will_state(tmp_path: Path) -> None:
     total = math.hypot(*(line["latitude_deg"] for line in declared["budget"]))
     assert total == pytest.approx(declared["latitude_sd_deg"], rel=1e-4)
     assert "taken as exact" in northfinder("budget", "--time", "120", "--latitude", "50.4", "--latitude-sd", "0")
+
+
+def test_calibrate_finds_the_constants_and_says_what_it_rests_on(records: list[Path], calibration: Path) -> None:
+    """Each constant within four of its standard deviations; whose gyro, since when, until when, how warm."""
+    found = read_calibration(calibration)
+    drift = found.acceleration_sensitive
+    assert abs(drift.drift_rate_dph_per_g - 3.0) < 4.0 * drift.drift_rate_sd_dph_per_g < 1.0
+    assert abs(drift.scale_factor - 1.021) < 4.0 * drift.scale_factor_sd < 0.1
+    assert found.ratio is not None
+    assert abs(found.ratio.ratio - 0.797) < 4.0 * found.ratio.ratio_sd
+    assert found.azimuth is not None
+    assert abs(found.azimuth.offset_deg - 3.0) < 4.0 * found.azimuth.offset_sd_deg
+    assert (found.serial_number, found.n_records, found.supported) == ("SIM-G12", 3, None)
+    assert str(found.date) == "1970-01-01"  # the virtual clock starts there
+    assert str(found.valid_until) == "1971-01-01"
+    assert found.temperature_min_c == pytest.approx(24.0, abs=0.1)
+    everywhere = as_json("calibrate", *records, *["--latitude", 50.429] * 3, "--latitude", 30.0)
+    assert everywhere["supported"] == "acceleration-sensitive"
+    assert "support" in everywhere["verdict"]
+    shown = " ".join(northfinder("calibrate", *records[:3], "--latitude", 50.429).split())
+    assert "measure at another one to tell them apart" in shown
+
+
+def test_a_calibration_is_applied_and_reported(records: list[Path], calibration: Path, tmp_path: Path) -> None:
+    """Elsewhere the drift rate is right within the statement and the ratio 2.6 deg wrong; azimuths move."""
+    plain = as_json("solve", records[3])
+    right = as_json("solve", records[3], "--calibration", calibration)
+    assert abs(right["latitude_deg"] - 30.0) < 4.0 * right["latitude_sd_deg"] < 2.0
+    offset = right["calibration"]["azimuth_offset_deg"]
+    assert math.remainder(right["azimuth_deg"] - plain["azimuth_deg"] + offset, 360.0) == pytest.approx(0.0, abs=0.05)
+    lines = {line["quantity"]: line for line in right["budget"]}
+    assert lines["azimuth offset"]["azimuth_deg"] == pytest.approx(read_calibration(calibration).azimuth.offset_sd_deg)  # type: ignore[union-attr]
+    for name in ("azimuth", "latitude"):
+        total = math.hypot(*(line[f"{name}_deg"] for line in right["budget"]))
+        assert total == pytest.approx(right[f"{name}_sd_deg"], rel=1e-4)
+    ratio = tmp_path / "ratio.toml"
+    northfinder("calibrate", *records[:3], "--latitude", 50.429, "--model", "ratio", "--save", ratio)
+    wrong = as_json("solve", records[3], "--calibration", ratio)
+    assert wrong["calibration"]["model"] == "ratio"
+    assert wrong["latitude_deg"] - right["latitude_deg"] == pytest.approx(2.6, abs=0.3)
+    total = math.hypot(*(line["latitude_deg"] for line in wrong["budget"]))
+    assert total == pytest.approx(wrong["latitude_sd_deg"], rel=1e-4)
+
+
+def test_a_calibration_of_another_gyro_or_time_is_refused(
+    records: list[Path], calibration: Path, tmp_path: Path
+) -> None:
+    """One clear sentence with both serial numbers, or with date and validity; find refuses before anything moves."""
+    text = calibration.read_text()
+    other, later = tmp_path / "other.toml", tmp_path / "later.toml"
+    other.write_text(text.replace("SIM-G12", "SIM-G13"))
+    later.write_text(text.replace("date = 1970-01-01", "date = 1970-06-01"))
+    with pytest.raises(ConfigError, match="'SIM-G13', and this one has 'SIM-G12'"):
+        northfinder("solve", records[3], "--calibration", other)
+    with pytest.raises(ConfigError, match="valid from 1970-06-01 to 1971-01-01, not on 1970-01-01"):
+        northfinder("solve", records[3], "--calibration", later)
+    with pytest.raises(ConfigError, match="is valid from 1970-01-01 to 1971-01-01, not on 20"):
+        northfinder("find", "--speed", "max", "--calibration", calibration, "--out", tmp_path)
+    with pytest.raises(RecordError, match="never overwritten"):
+        northfinder("calibrate", *records[:3], "--latitude", 50.429, "--save", calibration)
+    later.write_text(text.replace('model = "acc', 'modell = "acc'))
+    with pytest.raises(ConfigError, match="modell"):
+        northfinder("solve", records[3], "--calibration", later)
+
+
+def test_a_calibration_needs_one_gyro_and_known_places(records: list[Path], tmp_path: Path) -> None:
+    """Records of two gyros, a missing latitude and too many of them are the operator's mistakes, each named."""
+    stranger = tmp_path / "stranger.sqlite"
+    virtual_bench(seed=13).measure(stranger, six_position(5.0))
+    with pytest.raises(ConfigError, match=r"'SIM-G12', .* of 'SIM-G13'"):
+        northfinder("calibrate", records[0], stranger, "--latitude", 50.429)
+    with pytest.raises(ConfigError, match="give --latitude"):
+        northfinder("calibrate", records[0])
+    with pytest.raises(ConfigError, match="given 2 times for 3 records"):
+        northfinder("calibrate", *records[:3], "--latitude", 1, "--latitude", 2)

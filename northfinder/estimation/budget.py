@@ -19,7 +19,7 @@ from northfinder.estimation.least_squares import Weights, _assumed_vertical
 from northfinder.estimation.linear import Drift
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
-from northfinder.estimation.propagation import Gains, Propagation, gains
+from northfinder.estimation.propagation import Gains, Propagation, by_tilt, gains
 
 Array = NDArray[np.float64]
 
@@ -180,13 +180,11 @@ def _noise_lines(path: Propagation, fix: Fix, gain: Gains) -> list[Contribution]
 
 def _known_lines(path: Propagation, fix: Fix, known: Known, gain: Gains, declared: Declared) -> list[Contribution]:
     """Return what `estimate` itself took as known within a standard deviation."""
-    north, east, vertical = fix.rates
-    by_tilt = np.array([[-vertical, 0.0], [0.0, vertical], [north, -east]])
     drift_sd, correlation = known.acceleration_sensitive_drift_rate_sd, declared.scale_drift_correlation
     by_scale = gain.scale_factor * known.scale_factor_sd - correlation * drift_sd * gain.rates[:, 2]
     drift_alone_sd = drift_sd * math.sqrt(1.0 - correlation**2)
     lines = [
-        _line("tilt", known.tilt_sd, "rad", "B", (known.tilt_sd * gain.rates @ by_tilt).T),
+        _line("tilt", known.tilt_sd, "rad", "B", (known.tilt_sd * gain.rates @ by_tilt(fix.rates)).T),
         _line("scale factor", known.scale_factor_sd, "1", "B", [by_scale]),
         _line("acceleration-sensitive drift rate", drift_alone_sd, "rad/s/g", "B", [drift_alone_sd * gain.rates[:, 2]]),
         _line("latitude entry", known.latitude_sd, "rad", "B", [known.latitude_sd * gain.latitude]),
