@@ -109,6 +109,7 @@ class Wire:
     def __init__(self, bench: CanBench, bitrate: int) -> None:
         self.bitrate = bitrate
         self.off = False  #: nothing passes: the hosts' controllers are off the bus
+        self.unplugged = False  #: the hosts' adapters are gone
         self.taps: list[Tap] = []
         self._bench = bench
 
@@ -140,6 +141,10 @@ class Wire:
         for tap in self.taps:
             if tap.attuned:
                 tap.waiting.extend([(now_us, identifier, data) for identifier, data in frames])
+
+    def unplug(self) -> None:
+        """Take the hosts' adapters away."""
+        self.unplugged = True
 
     def switch_off(self, *, off: bool) -> None:
         """Let the hosts' controllers go off the bus, as after too many errors, or come back."""

@@ -17,6 +17,8 @@ Faults are written as text, ``DEVICE:NAME[=VALUE][@SECONDS[+SECONDS]]``, the ins
 ``e-stop@T``                          stage: the emergency stop is pressed, for D seconds with ``+D``
 ``sensor-fault@T``                    gyro: its supervision trips
 ====================================  ==================================================================
+
+A CAN bus has some of them and others of its own, see `sim_device.can_server`.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ RUNAWAY_SPEED = math.radians(5.0)  #: rad/s
 ENCODER_JUMP = math.radians(5.0)  #: rad
 GARBAGE_BYTES = 32  #: at most
 
-_SPEC = re.compile(r"(gyro|stage):([a-z-]+)(?:=([^@]+))?(?:@(\d+(?:\.\d+)?)(?:\+(\d+(?:\.\d+)?))?)?")
+_SPEC = re.compile(r"(gyro|stage|bus):([a-z-]+)(?:=([^@]+))?(?:@(\d+(?:\.\d+)?)(?:\+(\d+(?:\.\d+)?))?)?")
 
 
 class Endpoint(Protocol):
@@ -211,7 +213,7 @@ def schedule(specs: list[FaultSpec], bench: World) -> None:
 
 
 def _action(spec: FaultSpec, bench: World) -> Callable[[], None]:
-    if spec.name == "reset":
+    if spec.name == "reset" and spec.device != "bus":
         return lambda: bench.reset(spec.device)
     if spec.device == "gyro" and spec.name == "sensor-fault":
         return lambda: setattr(bench.gyro_board, "sensor_fault", True)

@@ -81,11 +81,9 @@ class TcpPort:
     """
 
     def __init__(self, host: str, port: int = 0) -> None:
-        self._listener = socket.create_server((host, port), family=_family(host))
-        self._listener.settimeout(0)
+        self._listener, name = listen(host, port)
         self._client: socket.socket | None = None
-        name = f"[{host}]" if ":" in host else host
-        self.address = f"socket://{name}:{self._listener.getsockname()[1]}"
+        self.address = f"socket://{name}"
 
     @property
     def handles(self) -> tuple[int, ...]:
@@ -147,8 +145,13 @@ class TcpPort:
             self._client = None
 
 
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
+def listen(host: str, port: int = 0) -> tuple[socket.socket, str]:
+    """Return a socket that listens without waiting, and ``HOST:PORT`` as a host would write it."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.create_server((host, port), family=family)
+    listener.settimeout(0)
+    name = f"[{host}]" if ":" in host else host
+    return listener, f"{name}:{listener.getsockname()[1]}"
 
 
 class Connection:

@@ -1,4 +1,6 @@
-"""Serves an emulated bench on two pseudo-terminals or TCP ports, at any speed: ``python -m sim_device``.
+"""Serves an emulated bench, at any speed: ``python -m sim_device``.
+
+On two pseudo-terminals or TCP ports, or on a CAN bus.
 
 Prints one line of JSON with the addresses, then serves until it is told to stop.
 """
@@ -14,11 +16,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
-from sim_device.bench import Line, SimBench
+from sim_device.bench import Line, SimBench, World
+from sim_device.can_bench import BITRATE, CanBench
+from sim_device.can_server import BUSES, BusConnection, schedule_bus
+from sim_device.can_server import open_port as open_bus_port
 from sim_device.faults import Endpoint, FaultSpec, FaultyLine, LinkFaults, link_faults, schedule
 from sim_device.pace import Pace
 from sim_device.plant.gyro import ARCSEC
@@ -40,25 +46,40 @@ class ServeOptions:
     speed: float = 1.0  #: times real time, inf for as fast as the host keeps up
     only: str = ""  #: "gyro" or "stage", both if empty
     tcp: str = ""  #: address to listen on, pseudo-terminals if empty
+    bus: str = ""  #: "socketcand" or "slcan" for a CAN bus, serial lines if empty
+    bitrate: int = BITRATE  #: of the CAN bus
     faults: tuple[str, ...] = ()  #: see `sim_device.faults`
     parent_death: bool = False  #: stop when standard input ends, as it does when the parent dies
 
 
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A bench behind its ports."""
+
+    bench: World
+    connections: Sequence[Connection | BusConnection]
+    addresses: dict[str, str]  #: by device
+
+
 def make_bench(options: ServeOptions) -> SimBench:
-    """Return the bench that the options describe; ValueError if they do not make sense."""
+    """Return the bench on serial lines that the options describe; ValueError if they do not make sense."""
+    return SimBench(options.profile, **_world(options))
+
+
+def _world(options: ServeOptions) -> dict[str, Any]:
+    """Return what the options say of the world; ValueError if it makes no sense."""
     if not -90 <= options.latitude_deg <= 90:
         raise ValueError(f"the latitude must be from -90 to 90 deg, got {options.latitude_deg:g}")
     if not all(map(math.isfinite, (options.azimuth_deg, *options.tilt_arcsec))):
         raise ValueError("azimuth and tilt must be finite numbers")
     if options.seed < 0:
         raise ValueError(f"the seed must not be negative, got {options.seed}")
-    return SimBench(
-        options.profile,
-        seed=options.seed,
-        azimuth=math.radians(options.azimuth_deg),
-        latitude=math.radians(options.latitude_deg),
-        tilt=(options.tilt_arcsec[0] * ARCSEC, options.tilt_arcsec[1] * ARCSEC),
-    )
+    return {
+        "seed": options.seed,
+        "azimuth": math.radians(options.azimuth_deg),
+        "latitude": math.radians(options.latitude_deg),
+        "tilt": (options.tilt_arcsec[0] * ARCSEC, options.tilt_arcsec[1] * ARCSEC),
+    }
 
 
 def serve(options: ServeOptions, stop: threading.Event | None = None) -> None:
@@ -71,24 +92,38 @@ def serve(options: ServeOptions, stop: threading.Event | None = None) -> None:
 
     """
     stop = stop or threading.Event()
-    bench = make_bench(options)
-    pace = Pace(bench, options.speed)
-    specs = [FaultSpec.parse(text) for text in options.faults]
-    schedule(specs, bench)
-    lines = [line for line in (bench.gyro, bench.stage) if options.only in {"", line.name}]
-    connections = [Connection(line, _endpoint(line, specs, options.seed), _open_port(options)) for line in lines]
+    served = _open_bus(options) if options.bus else _open_lines(options)
+    pace = Pace(served.bench, options.speed)
     if options.parent_death:
         threading.Thread(target=_watch_input, args=(stop,), daemon=True).start()
     try:
         with _stopped_by_signals(stop):
-            _announce(options, connections)
-            _run(pace, bench, connections, stop)
+            _announce(options, served.addresses)
+            _run(pace, served.bench, served.connections, stop)
     finally:
-        for connection in connections:
+        for connection in served.connections:
             connection.port.close()
 
 
-def _run(pace: Pace, bench: SimBench, connections: list[Connection], stop: threading.Event) -> None:
+def _open_lines(options: ServeOptions) -> Served:
+    bench = make_bench(options)
+    specs = [FaultSpec.parse(text) for text in options.faults]
+    schedule(specs, bench)
+    lines = [line for line in (bench.gyro, bench.stage) if options.only in {"", line.name}]
+    connections = [Connection(line, _endpoint(line, specs, options.seed), _open_port(options)) for line in lines]
+    addresses = {connection.line.name: f"native:{connection.port.address}" for connection in connections}
+    return Served(bench, connections, addresses)
+
+
+def _open_bus(options: ServeOptions) -> Served:
+    bench = CanBench(options.profile, bitrate=options.bitrate, **_world(options))
+    bench.lines = tuple(seat for seat in bench.lines if options.only in {"", seat.name})
+    schedule_bus([FaultSpec.parse(text) for text in options.faults], bench)
+    connection = BusConnection(bench, open_bus_port(bench, options.bus, options.tcp or LOOPBACK))
+    return Served(bench, [connection], connection.addresses)
+
+
+def _run(pace: Pace, bench: World, connections: Sequence[Connection | BusConnection], stop: threading.Event) -> None:
     begin = time.monotonic()
     with selectors.DefaultSelector() as selector:
         watched: list[int] = []
@@ -105,7 +140,7 @@ def _run(pace: Pace, bench: SimBench, connections: list[Connection], stop: threa
                 pass
 
 
-def _bring_out(connections: list[Connection], now_us: int) -> bool:
+def _bring_out(connections: Sequence[Connection | BusConnection], now_us: int) -> bool:
     return sum(connection.bring_out(now_us) for connection in connections) > 0
 
 
@@ -131,8 +166,7 @@ def _open_port(options: ServeOptions) -> Port:
         return TcpPort(LOOPBACK)
 
 
-def _announce(options: ServeOptions, connections: list[Connection]) -> None:
-    addresses = {connection.line.name: f"native:{connection.port.address}" for connection in connections}
+def _announce(options: ServeOptions, addresses: dict[str, str]) -> None:
     facts = {
         "profile": options.profile,
         "seed": options.seed,
@@ -188,6 +222,8 @@ def main(arguments: list[str] | None = None) -> int:
     add("--speed", type=parse_speed, default=1.0, metavar="X|max", help="times real time, at least 1")
     add("--only", choices=["gyro", "stage"], default="", help="serve this device alone")
     add("--tcp", nargs="?", const=LOOPBACK, default="", metavar="HOST", help="TCP instead of pseudo-terminals")
+    add("--bus", choices=BUSES, default="", help="a CAN bus instead of serial lines")
+    add("--bitrate", type=int, default=BITRATE, help="of the CAN bus, bit/s")
     add("--fault", action="append", default=[], metavar="FAULT", help="such as gyro:drop=1e-4 or stage:e-stop@30+5")
     add("--parent-death", action="store_true", help="stop when standard input ends")
     given = parser.parse_args(arguments)
@@ -200,6 +236,8 @@ def main(arguments: list[str] | None = None) -> int:
         speed=given.speed,
         only=given.only,
         tcp=given.tcp,
+        bus=given.bus,
+        bitrate=given.bitrate,
         faults=tuple(given.fault),
         parent_death=given.parent_death,
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import click
 
 from northfinder.errors import ConfigError
+from sim_device.can_bench import BITRATE
+from sim_device.can_server import BUSES
 from sim_device.server import ServeOptions, parse_speed, serve
 
 
@@ -47,6 +49,8 @@ from sim_device.server import ServeOptions, parse_speed, serve
     metavar="[HOST]",
     help="Serve TCP instead of pseudo-terminals, on the loopback interface unless HOST says otherwise.",
 )
+@click.option("--bus", type=click.Choice(BUSES), default="", help="Serve a CAN bus instead of serial lines.")
+@click.option("--bitrate", type=int, default=BITRATE, show_default=True, help="Of the CAN bus, bit/s.")
 @click.option("--fault", "faults", multiple=True, metavar="FAULT", help="As stage:e-stop@30; may be repeated.")
 def command(
     *,
@@ -57,12 +61,15 @@ def command(
     tilt_arcsec: tuple[float, float],
     speed: str,
     tcp: str,
+    bus: str,
+    bitrate: int,
     faults: tuple[str, ...],
 ) -> None:
     """Serve an emulated gyro and stage until interrupted, and print their addresses as one line of JSON.
 
     \b
       northfinder emulate
+      northfinder emulate --bus socketcand --speed max
       northfinder emulate --tcp --speed 10 --fault gyro:drop=1e-5 --fault stage:e-stop@120
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
     try:
@@ -75,6 +82,8 @@ def command(
                 tilt_arcsec=tilt_arcsec,
                 speed=parse_speed(speed),
                 tcp=tcp,
+                bus=bus,
+                bitrate=bitrate,
                 faults=faults,
             )
         )
