@@ -10,7 +10,8 @@ from typing import Any, Protocol
 from drivers.api import Clock, Gyro, RateBlock, Stage
 from northfinder.errors import EstimateError
 from northfinder.estimation import Fix
-from northfinder.record import DwellSpan, Recorder
+from northfinder.record import DwellSpan
+from northfinder.recorder import Recorder
 from northfinder.reduction import Reduction
 from northfinder.sequencer import Plan, Progress, Sequencer
 from northfinder.solution import Assumptions, before_offset, fix_to_json, solve, supplement

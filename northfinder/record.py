@@ -14,8 +14,8 @@ closed, one plain file remains. Times are in s, angles in rad, rates in rad/s pe
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -31,12 +31,10 @@ from northfinder.errors import RecordError
 #: "NFR1" in the file's header tells a record from any other SQLite file.
 APPLICATION_ID = 0x4E465231
 SCHEMA_VERSION = 1
-#: What has arrived is handed to the file at least this often, in s.
-WRITE_PERIOD = 0.1
 #: A block longer than this is no block of ours, in bytes.
 MAX_BLOCK_BYTES = 1 << 20
 
-_SCHEMA = """
+SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE block (
     id INTEGER PRIMARY KEY, first_index INTEGER NOT NULL, n_samples INTEGER NOT NULL, n_axes INTEGER NOT NULL,
@@ -81,145 +79,6 @@ def _one_line(path: Path, doing: str) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise RecordError(f"the record {path} cannot be {doing}: {error}") from error
-
-
-class Recorder:
-    """Writes a new record. Use as a context manager; whatever ends the block, the record is closed."""
-
-    def __init__(self, path: Path, now: Callable[[], float]) -> None:
-        """Create the file `path`, which must not exist; `now` tells the host's time in s. Raises RecordError."""
-        self.path = path
-        self._now = now
-        self._blocks: list[tuple[object, ...]] = []
-        self._states: list[tuple[object, ...]] = []
-        self._next_write = now() + WRITE_PERIOD
-        self._failed = False
-        self._closed = False
-        self.n_samples = 0
-        self.n_lost = 0
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.open("xb").close()
-        except FileExistsError:
-            raise RecordError(f"the record {path} exists already, and records are never overwritten") from None
-        except OSError as error:
-            raise RecordError(f"the record {path} cannot be created: {error.strerror}") from None
-        with _one_line(path, "created"):
-            self._db = sqlite3.connect(path, isolation_level=None)
-            self._db.execute("PRAGMA journal_mode = WAL")
-            self._db.execute("PRAGMA synchronous = NORMAL")
-            self._db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            self._db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            self._db.executescript(_SCHEMA)
-
-    def __enter__(self) -> Self:
-        """Return the recorder itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Close the record; a failure to do so does not hide the exception that ended the block."""
-        try:
-            self.close()
-        except RecordError:
-            if error is None:
-                raise
-
-    def set_meta(self, key: str, value: object) -> None:
-        """Keep `value`, anything that can be JSON, under `key`."""
-        row: tuple[object, ...] = (key, msgspec.json.encode(value).decode())
-        self._put(("INSERT OR REPLACE INTO meta VALUES (?, ?)", [row]))
-
-    def add_block(self, block: RateBlock) -> None:
-        """Keep a block of samples."""
-        counts = np.ascontiguousarray(block.counts)
-        data = counts.astype(counts.dtype.newbyteorder("<"), copy=False).tobytes()
-        dtype = "<f4" if counts.dtype.kind == "f" else "<i4"
-        tilt = block.tilt if block.tilt is not None else (None, None)
-        self._blocks.append(
-            (
-                block.first_index, counts.shape[0], counts.shape[1], block.device_time, block.arrival_time,
-                block.rate_lsb, dtype, block.temperature, *tilt, int(block.status), block.n_lost,
-                fastcrc.crc32.iscsi(data), data,
-            )
-        )  # fmt: skip
-        self.n_samples += counts.shape[0]
-        self.n_lost += block.n_lost
-        self._write_if_due()
-
-    def add_state(self, state: StageState) -> None:
-        """Keep a reported state of the stage."""
-        self._states.append(
-            (
-                state.device_time, state.arrival_time, state.mode.value, state.azimuth, state.elevation,
-                state.azimuth_rate, state.elevation_rate, int(state.in_position), state.fault,
-            )
-        )  # fmt: skip
-        self._write_if_due()
-
-    def add_step(self, span: DwellSpan) -> None:
-        """Keep a finished dwell."""
-        self.write()
-        row: tuple[object, ...] = (
-            span.step, span.name, span.azimuth, span.elevation, span.dwell, span.measured_azimuth,
-            span.measured_elevation, span.first_index, span.stop_index, span.sample_rate,
-        )  # fmt: skip
-        self._put(("INSERT INTO step VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", [row]))
-
-    def add_event(self, kind: str, detail: str = "") -> None:
-        """Keep that something happened now."""
-        self.write()
-        self._put(("INSERT INTO event (time, kind, detail) VALUES (?, ?, ?)", [(self._now(), kind, detail)]))
-
-    def add_fix(self, value: object) -> None:
-        """Keep what was estimated."""
-        self.write()
-        row: tuple[object, ...] = (self._now(), msgspec.json.encode(value).decode())
-        self._put(("INSERT INTO fix (time, value) VALUES (?, ?)", [row]))
-
-    def _write_if_due(self) -> None:
-        if self._now() >= self._next_write:
-            self.write()
-
-    def write(self) -> None:
-        """Hand over to the file all that has arrived."""
-        self._next_write = self._now() + WRITE_PERIOD
-        blocks, self._blocks = self._blocks, []
-        states, self._states = self._states, []
-        if blocks or states:
-            self._put(
-                ("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", blocks),
-                ("INSERT INTO stage_state VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?)", states),
-            )
-
-    def _put(self, *inserts: tuple[str, list[tuple[object, ...]]]) -> None:
-        """Write rows, all or none. Once that has failed the record is as good as closed: it takes nothing more."""
-        if self._failed:
-            return
-        try:
-            self._db.execute("BEGIN")
-            for statement, rows in inserts:
-                self._db.executemany(statement, rows)
-            self._db.execute("COMMIT")
-        except sqlite3.Error as error:
-            self._failed = True
-            with suppress(sqlite3.Error):
-                self._db.rollback()
-            raise RecordError(f"the record {self.path} cannot be written: {error}") from error
-
-    def close(self) -> None:
-        """Write what is left and make one file of the record. Closing twice is no error."""
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            self.write()
-            self._db.execute("PRAGMA journal_mode = DELETE")
-        except sqlite3.Error as error:
-            raise RecordError(f"the record {self.path} cannot be closed: {error}") from error
-        finally:
-            self._db.close()
 
 
 class Record:

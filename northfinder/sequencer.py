@@ -20,7 +20,8 @@ from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError
 from northfinder.cyclogram import Standing, Step, reachable_azimuth
 from northfinder.errors import NorthFinderError, SequenceError
 from northfinder.estimation import Fix
-from northfinder.record import DwellSpan, Recorder
+from northfinder.record import DwellSpan
+from northfinder.recorder import Recorder
 
 
 class State(Enum):

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from drivers.api import GyroStatus, RateBlock, StageMode, StageState
 from northfinder.errors import RecordError
-from northfinder.record import WRITE_PERIOD, DwellSpan, Record, Recorder
+from northfinder.record import DwellSpan, Record
+from northfinder.recorder import WRITE_PERIOD, Recorder
 
 
 def now() -> float:
@@ -102,6 +103,7 @@ def test_what_has_arrived_is_handed_over_in_time(tmp_path: Path) -> None:
         with Record(path) as record:
             assert list(record.blocks()) == []
         recorder.add_block(block(4))
+        recorder._writer.flush()
         with Record(path) as record:
             assert [each.first_index for each in record.blocks()] == [0, 4]
 
@@ -113,10 +115,10 @@ def test_a_killed_recorder_leaves_a_readable_record(tmp_path: Path) -> None:
         "import sys; sys.path.insert(0, sys.argv[2])\n"
         "from pathlib import Path\n"
         "from test_record import block, now\n"
-        "from northfinder.record import Recorder\n"
+        "from northfinder.recorder import Recorder\n"
         "recorder = Recorder(Path(sys.argv[1]), now)\n"
         "for k in range(50):\n"
-        "    recorder.add_block(block(4 * k)); recorder.write()\n"
+        "    recorder.add_block(block(4 * k)); recorder.flush()\n"
         "print('written', flush=True)\n"
         "sys.stdin.read()\n"
     )
@@ -142,17 +144,35 @@ def test_a_record_is_never_overwritten(tmp_path: Path) -> None:
     assert path.read_bytes() == b"precious"
 
 
+def test_a_file_that_does_not_take_anything_holds_up_nobody(tmp_path: Path) -> None:
+    """While another program has locked the file, blocks are taken as fast as ever, and are written once it lets go."""
+    path = tmp_path / "north.sqlite"
+    with Recorder(path, now) as recorder:
+        stranger = sqlite3.connect(path, isolation_level=None)
+        stranger.execute("BEGIN IMMEDIATE")
+        for k in range(100):
+            recorder.add_block(block(4 * k))
+            recorder.write()
+        with Record(path) as record:
+            assert list(record.blocks()) == []
+        stranger.execute("ROLLBACK")
+        stranger.close()
+    with Record(path) as record:
+        assert [each.first_index for each in record.blocks()] == [4 * k for k in range(100)]
+
+
 def test_a_full_disk_is_said_at_once(tmp_path: Path) -> None:
     """When the file cannot grow the next write fails with one sentence, and what was written stays readable."""
     path = tmp_path / "north.sqlite"
     recorder = Recorder(path, now)
     recorder.add_block(block(0))
-    recorder.write()
-    pages = recorder._db.execute("PRAGMA page_count").fetchone()[0]
-    recorder._db.execute(f"PRAGMA max_page_count = {pages}")
+    recorder.flush()
+    pages = recorder._writer._db.execute("PRAGMA page_count").fetchone()[0]
+    recorder._writer._db.execute(f"PRAGMA max_page_count = {pages}")
     recorder.add_block(block(4, n=60_000))
     with pytest.raises(RecordError, match=r"north.sqlite cannot be written: database or disk is full"):
-        recorder.write()
+        recorder.flush()
+    recorder.add_block(block(60_004))  # taken no more, and not said again
     recorder.close()
     with Record(path) as record:
         assert [each.first_index for each in record.blocks()] == [0]

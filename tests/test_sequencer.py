@@ -16,7 +16,8 @@ from drivers.native import NativeStage
 from drivers.transport.virtual import VirtualLink
 from northfinder.cyclogram import Cyclogram, Step, six_position
 from northfinder.errors import ConfigError, RecordError
-from northfinder.record import Record, Recorder
+from northfinder.record import Record
+from northfinder.recorder import Recorder
 from northfinder.sequencer import TRANSITIONS, Event, Progress, Sequencer, State, StopRequestedError
 
 #: The six positions in ten seconds each.
@@ -213,7 +214,7 @@ def test_a_full_disk_stops_the_stage(tmp_path: Path) -> None:
     """When the record cannot grow the measurement ends with that sentence, and the stage is at rest."""
     bench = virtual_bench()
     with sequencer(bench, tmp_path / "r.sqlite") as sequence:
-        sequence.recorder._db.execute("PRAGMA max_page_count = 60")
+        sequence.recorder._writer._db.execute("PRAGMA max_page_count = 60")
         with pytest.raises(RecordError, match="database or disk is full"):
             sequence.run()
     assert stage_speed(bench, 0.0) == 0.0

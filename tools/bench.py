@@ -28,7 +28,7 @@ from drivers.protocol.native import decode_samples
 from drivers.transport.clock import SystemClock
 from drivers.transport.virtual import VirtualClock, VirtualLink
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
-from northfinder.record import Recorder
+from northfinder.recorder import Recorder
 from sim_device.bench import SimBench
 
 #: What the project promises; the figures are printed beside them.
