@@ -67,3 +67,15 @@ def test_too_few_means_to_judge_are_all_kept() -> None:
     """One mean a dwell has no neighbours to differ from, and data without noise have no outliers."""
     assert undisturbed(CLEAN.per_dwell()).all()
     assert undisturbed(CLEAN).all()
+
+
+def test_the_odd_short_mean_of_angle_white_noise_is_kept() -> None:
+    """A mean over a tenth of a second scatters ten times more than one over a second, and is no knock for that."""
+    rng = np.random.default_rng(25)
+    duration = np.tile([1.0, 1.0, 1.0, 1.0, 0.1], 40)
+    noise = rng.standard_normal(duration.size) / duration
+    means = RateMeans(
+        start=np.cumsum(duration) - duration, duration=duration, rate=noise * DPH,
+        azimuth=np.zeros(duration.size), elevation=np.zeros(duration.size), dwell=np.zeros(duration.size),
+    )  # fmt: skip
+    assert undisturbed(means).all()

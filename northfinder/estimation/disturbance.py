@@ -19,15 +19,18 @@ _SD_OF_MEDIAN_DEVIATION = 1.4826  # of Gaussian noise (Rousseeuw and Croux, J. A
 def undisturbed(means: RateMeans, *, limit: float = LIMIT) -> NDArray[np.bool_]:
     """Return which means to keep, shape (n,): those near the median of their dwell on every axis.
 
-    The scale is the median absolute deviation over all dwells, times the square root of the duration where the means
-    are not equally long; up to half of the means may be disturbed without spoiling it. Use with `RateMeans.select`.
+    The scale is the median absolute deviation over all dwells; up to half of the means may be disturbed without
+    spoiling it. A mean longer or shorter than most is judged as if its noise went as the least favourable power of its
+    duration: the square root for a longer one (angle random walk), the duration itself for a shorter one (angle white
+    noise), so that the odd short mean at the end of a dwell is not taken for a knock. Use with `RateMeans.select`.
     """
     _, dwell = np.unique(means.dwell, return_inverse=True)
     judged = np.bincount(dwell)[dwell] >= ENOUGH
     if not judged.any():
         return np.ones(means.n, dtype=bool)
     median = np.array([np.median(means.rate[dwell == i], axis=0) for i in range(dwell[-1] + 1)])
-    length = np.sqrt(means.duration / np.median(means.duration))[:, np.newaxis]
+    ratio = means.duration / np.median(means.duration)
+    length = np.minimum(ratio, np.sqrt(ratio))[:, np.newaxis]
     distance = np.abs(means.rate - median[dwell]) * length
     scale = _SD_OF_MEDIAN_DEVIATION * np.median(distance[judged], axis=0)
     rounding = np.finfo(np.float64).eps * np.max(np.abs(means.rate))
