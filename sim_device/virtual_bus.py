@@ -32,7 +32,7 @@ class BusPump:
     def step(self, now_us: int) -> None:
         """Bring the bench to `now_us`, in world time, with what has come over the bus."""
         while (message := self._bus.recv(0)) is not None:
-            self._tap.send(_identifier(message), bytes(message.data), now_us)
+            self._take(message, now_us)
         self._bench.advance_to(now_us)
         waiting = self._tap.waiting
         while waiting:
@@ -42,8 +42,15 @@ class BusPump:
     def run(self, stop: threading.Event, speed: float = 1.0) -> None:
         """Go with wall time, `speed` times as fast, until `stop` is set."""
         begin, origin_us = time.monotonic(), self._bench.now_us
-        while not stop.wait(_STEP_S):
-            self.step(origin_us + round((time.monotonic() - begin) * 1e6 * speed))
+        while not stop.is_set():
+            message = self._bus.recv(_STEP_S)
+            now_us = origin_us + round((time.monotonic() - begin) * 1e6 * speed)
+            if message is not None:
+                self._take(message, now_us)
+            self.step(now_us)
+
+    def _take(self, message: can.Message, now_us: int) -> None:
+        self._tap.send(_identifier(message), bytes(message.data), now_us)
 
 
 def _identifier(message: can.Message) -> int:

@@ -178,10 +178,8 @@ class GyroNode(Node):
         self._mark_due = first + max(1, self.dictionary.get(0x201400) * board.sample_rate_millihz // 1_000_000)
         for number in (_TIME_PDO, _SLOW_PDO):
             pdo = self._transmit[number - 1]
-            if pdo.kind > 240:
-                self._transmit_now(pdo)
-            else:
-                pdo.triggered = True
+            pdo.triggered = True
+        self._send_triggered()
 
     def _lose(self, n: int) -> None:
         self._n_lost += n

@@ -17,6 +17,7 @@ STARTED, STOP, PREPARE, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130  #
 STOPPED, OPERATIONAL, PRE_OPERATIONAL = 4, 5, 127  # NMT states
 
 _STATES = {STARTED: OPERATIONAL, STOP: STOPPED, PREPARE: PRE_OPERATIONAL}
+_LAST_SYNC_TYPE = 240  # transmission types beyond are of events
 _PDO_TOO_SHORT = 0x8210
 _PDO_REFUSED = 0x6320
 _COMMUNICATION = 0x10  # bits of the error register
@@ -181,10 +182,8 @@ class Node:
         if self.testing:
             dues.append(self._test_due_us)
         if self.state == OPERATIONAL:
-            for pdo in self._transmit:
-                timer_us = pdo.event_timer_us() if pdo.identifier != -1 else 0
-                if timer_us:
-                    dues.append(pdo.sent_us + timer_us)
+            timed = [pdo for pdo in self._transmit if pdo.timer_us and pdo.kind > _LAST_SYNC_TYPE]
+            dues += [pdo.sent_us + pdo.timer_us for pdo in timed]
         return min(dues) if dues else 1 << 62
 
     def _heartbeat_due_us(self) -> "int | None":
@@ -203,8 +202,7 @@ class Node:
             self.dictionary.put(0x203003, self._board.self_test())
         if self.state == OPERATIONAL:
             for pdo in self._transmit:
-                timer_us = pdo.event_timer_us()
-                if timer_us and pdo.sent_us + timer_us <= now_us:
+                if pdo.timer_us and pdo.kind > _LAST_SYNC_TYPE and pdo.sent_us + pdo.timer_us <= now_us:
                     pdo.triggered = True
 
     # NMT
@@ -261,7 +259,7 @@ class Node:
                     self._emergency(_PDO_TOO_SHORT, _COMMUNICATION)
                 continue
             self._recovered(_COMMUNICATION)
-            if pdo.kind >= 254:
+            if pdo.kind > _LAST_SYNC_TYPE:
                 self._apply(pdo, data)
             else:
                 pdo.received = data
@@ -290,7 +288,7 @@ class Node:
                 self._apply(pdo, data)
                 self._conclude(self._now_us)
         for pdo in self._transmit:
-            if pdo.kind > 240 or pdo.identifier == -1:
+            if pdo.kind > _LAST_SYNC_TYPE or pdo.identifier == -1:
                 continue
             pdo.n_syncs += 1
             if pdo.triggered if pdo.kind == 0 else pdo.n_syncs >= pdo.kind:
@@ -300,7 +298,7 @@ class Node:
         if self.state != OPERATIONAL:
             return
         for pdo in reversed(self._transmit):
-            if pdo.triggered and pdo.kind > 240:
+            if pdo.triggered and pdo.kind > _LAST_SYNC_TYPE:
                 self._transmit_now(pdo)
 
     def _transmit_now(self, pdo: Pdo) -> None:

@@ -45,6 +45,8 @@ class Pdo:
         Of the mapped objects.
     length : int
         In bytes.
+    timer_us : int
+        Longest time between two of its frames, 0 if there is none.
     """
 
     def __init__(self, dictionary: Dictionary, index: int) -> None:
@@ -58,6 +60,8 @@ class Pdo:
         self._transmits = index >= 0x1800
         dictionary.on_write(self._com + 1, self._set_identifier)
         dictionary.on_write(self._com + 2, self._set_kind)
+        if self._transmits:
+            dictionary.on_write(self._com + 5, self._set_timer)
         dictionary.on_write(self._map, self._set_count)
         for subindex in range(1, N_MAPPED + 1):
             dictionary.on_write(self._map + subindex, self._set_entry)
@@ -68,14 +72,11 @@ class Pdo:
         get = self._dictionary.get
         self._adopt(get(self._com + 1))
         self.kind = get(self._com + 2)
+        self.timer_us = get(self._com + 5) * 1000 if self._transmits else 0
         self._adopt_count(get(self._map))
         self.triggered = False
         self.n_syncs = 0
         self.received = b""
-
-    def event_timer_us(self) -> int:
-        """Return the longest time between two of its frames, 0 if there is none."""
-        return self._dictionary.get(self._com + 5) * 1000 if self.kind >= _FIRST_EVENT_TYPE else 0
 
     def data(self) -> bytes:
         """Return the mapped objects' present values."""
@@ -105,6 +106,10 @@ class Pdo:
             raise Abort(OUT_OF_RANGE)
         self.kind = value
         self.n_syncs = 0
+        return value
+
+    def _set_timer(self, value: int) -> int:
+        self.timer_us = value * 1000
         return value
 
     def _set_entry(self, value: int) -> int:
