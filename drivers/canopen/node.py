@@ -22,7 +22,7 @@ from drivers.canopen.network import SDO_TIMEOUT, LinkNetwork, LinkNode, SilenceE
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
 
 EDS_FOLDER = Path(__file__).parent.parent / "eds"
-HEARTBEAT_MS = 50  #: of a node, as the drivers ask for it
+HEARTBEAT_MS = 100  #: of a node, as the drivers ask for it
 MAX_SILENCE = 0.25  # s without a heartbeat; found within 300 ms by a host that looks each 50 ms
 LONGEST_LOOK = 0.1  # s; a host that was away for longer has not listened for longer
 SERVICE_PERIOD = 0.05  # s, how often a wait looks after the other duties
@@ -251,6 +251,10 @@ class Node:
                 f"two nodes answer as node {self.id} on {self._link.name}, with the serial numbers {serial_number} "
                 f"and {second}: give one of them another number"
             )
+
+    def save(self, pdo: canopen.pdo.PdoMap) -> None:
+        """Give the node a PDO's parameters and mapping. Raises as `read`."""
+        self._transfer(f"its mapping of PDO {pdo.cob_id or 0:03X}", pdo.save)
 
     def _transfer(self, what: str, transfer: Callable[[], T]) -> T:
         """Run a transfer, up to three times if nothing answers; turn canopen's exceptions into ours."""

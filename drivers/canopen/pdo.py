@@ -14,7 +14,7 @@ class PdoCodec:
     Parameters
     ----------
     pdo
-        A PDO of a canopen node; its identifier and mapping are those of the object dictionary.
+        A PDO of a canopen node; unless it has a mapping already it gets that of the object dictionary.
 
     Notes
     -----
@@ -22,7 +22,8 @@ class PdoCodec:
     """
 
     def __init__(self, pdo: canopen.pdo.PdoMap) -> None:
-        pdo.read(from_od=True)
+        if not pdo.map:
+            pdo.read(from_od=True)
         self.cob_id = pdo.cob_id or 0
         self.length: int = pdo.length // 8  #: bytes of a frame
         self._spans = {
@@ -45,6 +46,8 @@ class PdoCodec:
         """Return a frame of values by index and subindex; objects not given are 0."""
         number = 0
         for key, value in values.items():
+            if key not in self._spans:
+                raise KeyError(f"object {key[0]:04X}:{key[1]} is not in this PDO")
             offset, length, _ = self._spans[key]
             number |= (value & (1 << length) - 1) << offset
         return number.to_bytes(self.length, "little")

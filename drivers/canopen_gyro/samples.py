@@ -66,6 +66,7 @@ class SampleAssembler:
         self._axes = [_Axis() for _ in range(n_axes)]
         self._sample_rate = sample_rate
         self._block_samples = block_samples
+        self._fresh = False  # whether samples have come since `blocks`
         self._next = 0  # index after the newest sample given out
         self._mark = (0, 0)  # index of a sample, and its instant in us
         self._temperature: float | None = None
@@ -96,10 +97,14 @@ class SampleAssembler:
             If their numbers went back, or one came twice with different values.
         """
         if len(numbers):
+            self._fresh = True
             self._axes[axis].add(numbers, rates, status)
 
     def blocks(self, now: float, *, flush: bool = False) -> list[RateBlock]:
         """Return the blocks that are complete; with `flush` also the one under way."""
+        if not (self._fresh or flush):
+            return []
+        self._fresh = False
         samples = self._common()
         end = samples[-1, 0] + 1 if len(samples) else 0
         if not flush:

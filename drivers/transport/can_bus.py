@@ -13,7 +13,8 @@ from collections.abc import Iterable
 from drivers.api import BusCounts, Clock, FrameLink
 from drivers.errors import LinkError
 from drivers.transport.can_address import BusAddress
-from drivers.transport.can_port import BUS_OFF, ERROR, REMOTE, STANDARD_MASK, Frame, Port, PythonCanPort
+from drivers.transport.can_frames import ERROR, REMOTE, STANDARD_MASK, Frame, is_bus_off
+from drivers.transport.can_port import Port, PythonCanPort
 from drivers.transport.serial_port import DEFAULT_BAUDRATE
 from drivers.transport.slcan import SlcanPort
 from drivers.transport.socketcand import SocketcandPort
@@ -210,7 +211,7 @@ class _Bus:
                 self._n_remote += 1
                 continue
             self._n_errors += 1
-            if identifier & BUS_OFF:
+            if is_bus_off(identifier):
                 self._lose(f"{self.address.name} is off the bus after too many errors: check wiring and bit rate")
 
     def _lose(self, reason: str) -> None:

@@ -1,8 +1,4 @@
-"""One open CAN adapter each, whatever its kind: what the reader of a bus needs of it.
-
-Frames are pairs of identifier and data; the identifier carries SocketCAN's flags, so an error frame or a remote frame
-can never be taken for data.
-"""
+"""One open CAN adapter each, whatever its kind: what the reader of a bus needs of it."""
 
 from __future__ import annotations
 
@@ -15,15 +11,10 @@ import can
 from drivers.api import EXTENDED_IDENTIFIER
 from drivers.errors import LinkError
 from drivers.transport.can_address import SET_BITRATE, BusAddress
+from drivers.transport.can_frames import ERROR, EXTENDED_MASK, REMOTE, Frame
 
-REMOTE = 1 << 30
-ERROR = 1 << 29
-BUS_OFF = 0x40  #: class of an error frame: the controller has switched itself off
-STANDARD_MASK = 0x7FF
-EXTENDED_MASK = 0x1FFF_FFFF
 SEND_TIMEOUT = 1.0  # s
 _BATCH = 512  # frames a read at most
-Frame = tuple[int, bytes]
 
 # Its warnings are about what here becomes an exception or a count; without a handler they would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())

@@ -20,7 +20,7 @@ from contextlib import suppress
 from drivers.api import EXTENDED_IDENTIFIER
 from drivers.errors import LinkError
 from drivers.transport.can_address import BusAddress
-from drivers.transport.can_port import ERROR, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
+from drivers.transport.can_frames import ERROR, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
 from drivers.transport.serial_port import open_port, read_some, write_all
 
 BITRATES = {

@@ -21,7 +21,8 @@ from contextlib import suppress
 from drivers.api import EXTENDED_IDENTIFIER
 from drivers.errors import LinkError
 from drivers.transport.can_address import BusAddress, split_socketcand
-from drivers.transport.can_port import ERROR, EXTENDED_MASK, SEND_TIMEOUT, STANDARD_MASK, Frame
+from drivers.transport.can_frames import ERROR, EXTENDED_MASK, STANDARD_MASK, Frame
+from drivers.transport.can_port import SEND_TIMEOUT
 
 _CONNECT_TIMEOUT = 3.0  # s
 _CHUNK = 65536

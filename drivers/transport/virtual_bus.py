@@ -7,6 +7,7 @@ from typing import Protocol
 
 from drivers.api import BusCounts
 from drivers.errors import LinkError
+from drivers.transport.can_frames import is_bus_off, is_data
 from drivers.transport.virtual import VirtualClock
 
 
@@ -32,7 +33,7 @@ class VirtualBus:
         self._devices = devices
         self._clock = clock
         self._links: list[VirtualFrameLink] = []
-        self._n_frames = 0
+        self._n_frames = self._n_errors = 0
         self._identifiers: set[int] = set()
         clock.attach(self)
 
@@ -49,7 +50,7 @@ class VirtualBus:
 
     def counts(self) -> BusCounts:
         """Return what has been heard."""
-        return BusCounts(n_frames=self._n_frames, identifiers=frozenset(self._identifiers))
+        return BusCounts(n_frames=self._n_frames, n_errors=self._n_errors, identifiers=frozenset(self._identifiers))
 
     def send(self, identifier: int, data: bytes) -> None:
         """Hand a frame of a link to all devices; what they answer at once has arrived on return."""
@@ -57,7 +58,7 @@ class VirtualBus:
             for device in self._devices:
                 device.feed(identifier, data, self._clock.now_us)
         except ConnectionError as error:
-            self._lose(error)
+            self._lose(f"{self.name} was unplugged ({error})")
         self._poll()
 
     def due_us(self) -> int | None:
@@ -65,7 +66,7 @@ class VirtualBus:
         try:
             due = [device.next_due_us() for device in self._devices]
         except ConnectionError as error:
-            self._lose(error)
+            self._lose(f"{self.name} was unplugged ({error})")
             return None
         return min((at_us for at_us in due if at_us is not None), default=None)
 
@@ -86,14 +87,19 @@ class VirtualBus:
                 heard = True
                 self._pass_on(frames)
         except ConnectionError as error:
-            self._lose(error)
+            self._lose(f"{self.name} was unplugged ({error})")
         if heard:
             self._clock.notify()
         return heard
 
     def _pass_on(self, frames: list[tuple[FrameDevice, int, bytes]]) -> None:
-        self._n_frames += len(frames)
         for sender, identifier, data in frames:
+            if not is_data(identifier):
+                self._n_errors += 1
+                if is_bus_off(identifier):
+                    self._lose(f"{self.name} is off the bus after too many errors")
+                continue
+            self._n_frames += 1
             self._identifiers.add(identifier)
             for link in self._links:
                 link.take(identifier, data)
@@ -101,8 +107,8 @@ class VirtualBus:
                 if device is not sender:
                     device.feed(identifier, data, self._clock.now_us)
 
-    def _lose(self, error: ConnectionError) -> None:
-        self.lost = f"{self.name} was unplugged ({error})"
+    def _lose(self, reason: str) -> None:
+        self.lost = reason
         self._clock.detach(self)
         self._clock.notify()
 

@@ -1,0 +1,400 @@
+"""Two CiA 402 drives as one rotation stage. See ``docs/canopen.md``, section 4."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import degrees
+
+from drivers.api import Clock, DeviceIdentity, FrameLink, SelfTest, StageLimits, StageMode, StageState
+from drivers.canopen.identity import run_self_test
+from drivers.canopen.node import SERVICE_PERIOD
+from drivers.cia402 import setup
+from drivers.cia402.axis import AXIS_NAMES, Activity, Axis
+from drivers.cia402.options import DriveOptions
+from drivers.cia402.words import HOMING, PROFILE_POSITION, Control, DriveState
+from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError
+
+IDENTIFIERS = (0x080, 0x180, 0x280, 0x580, 0x700)  #: to which each node's number is added
+HEARTBEAT_PERIOD = 0.05  # s of host time; half of what the drives are promised, so that a late call does no harm
+HEARTBEAT_SPAN_MS = 100  # of device time
+ANSWER_TIMEOUT = 1.0  # s for a drive to go where it was told
+REST_TIMEOUT = 10.0  # s for a drive found moving to come to rest
+STOP_INTERVAL = 0.05  # s between repetitions of a stop
+STOP_ATTEMPTS = 20
+_MODES = {
+    Activity.OFFERED: StageMode.MOVING,
+    Activity.TAKEN: StageMode.MOVING,
+    Activity.MOVING: StageMode.MOVING,
+    Activity.HOMING_ASKED: StageMode.HOMING,
+    Activity.HOMING: StageMode.HOMING,
+    Activity.STOPPING: StageMode.STOPPING,
+}
+_ORDER = (StageMode.STOPPING, StageMode.HOMING, StageMode.MOVING)  # what the stage does if its axes differ
+
+
+class Cia402Stage:
+    """A stage of two drives on one bus; a `drivers.api.Stage`.
+
+    The drives watch the host's heartbeat, which `state` and every call that waits keep going: if the host dies in
+    motion they come to rest by themselves. A fault of one axis stops the other.
+
+    Parameters
+    ----------
+    links
+        To the bus, one for each axis, open at least for `IDENTIFIERS` of its node; the driver closes them.
+    clock
+        The clock that the links notify.
+    node_ids
+        Numbers of the azimuth and the elevation axis.
+    limits
+        Narrows the limits that the drives have; never widens them.
+    options
+        How the drives are used.
+    """
+
+    def __init__(
+        self,
+        links: Sequence[FrameLink],
+        clock: Clock,
+        node_ids: Sequence[int],
+        *,
+        limits: StageLimits | None = None,
+        options: DriveOptions | None = None,
+    ) -> None:
+        options = options or DriveOptions()
+        self._clock = clock
+        self._axes = [
+            Axis(link, clock, node_id, index, options)
+            for index, (link, node_id) in enumerate(zip(links, node_ids, strict=True))
+        ]
+        for axis in self._axes:
+            axis.node.duty = self._beat
+        self._own_limits = limits
+        self._limits: StageLimits | None = None
+        self._state: StageState | None = None
+        self._connected = False
+        self._beaten_at = 0.0
+        self._beaten_ms = 0
+
+    @property
+    def limits(self) -> StageLimits:
+        """Where the stage may be sent, known after `connect`."""
+        if self._limits is None:
+            raise LinkError(f"the limits of {self._names} are known after connect")
+        return self._limits
+
+    def connect(self) -> DeviceIdentity:
+        """Meet both drives, bring them to rest, configure them. Never moves.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            If a node does not answer.
+        ProtocolError
+            If one is no such drive, or two nodes have one number.
+        DeviceFaultError
+            If a drive refuses what it must be told.
+        """
+        self._state, self._connected = None, False
+        identities = [setup.meet(axis) for axis in self._axes]
+        for axis in self._axes:
+            setup.bring_to_rest(axis, self._waiter(axis, REST_TIMEOUT))
+            setup.configure(axis)
+            setup.map_pdos(axis)
+            axis.see_homed(self._waiter(axis))
+        self._limits = self._read_limits()
+        self._connected = True
+        for axis in self._axes:
+            axis.start_node()
+        self._refresh()
+        return self._identity(identities)
+
+    def self_test(self) -> SelfTest:
+        """Run the self-test of drives that have one, up to 3 s each. Never moves."""
+        failures = [
+            f"{AXIS_NAMES[axis.index]}: {failure}"
+            for axis in self._axes
+            if axis.ours
+            for failure in run_self_test(axis.node, self._clock).failures
+        ]
+        return SelfTest(tuple(failures))
+
+    def home(self) -> None:
+        """Begin homing of both axes; `state` tells when it is done. Enables the drives.
+
+        Raises
+        ------
+        DeviceFaultError
+            If a drive refuses, or is not at rest.
+        """
+        self._require_rest("homing")
+        self._enable(HOMING)
+        for axis in self._axes:
+            axis.start_homing()
+        self._await_both(lambda axis: axis.activity is not Activity.HOMING_ASKED, "begun homing")
+
+    def move(self, azimuth: float, elevation: float, *, speed: float | None = None) -> None:
+        """Begin a move of both axes to absolute angles in rad; `speed` in rad/s, the limit if None.
+
+        Raises
+        ------
+        ValueError
+            If the target or the speed lies outside `limits`.
+        DeviceFaultError
+            If a drive refuses, is not homed, or not at rest.
+        """
+        limits = self.limits
+        speed = limits.max_speed if speed is None else speed
+        self._require("azimuth", azimuth, limits.azimuth_min, limits.azimuth_max, "deg")
+        self._require("elevation", elevation, limits.elevation_min, limits.elevation_max, "deg")
+        self._require("speed", speed, 1 / self._axes[0].speed_units, limits.max_speed, "deg/s")
+        self._require_rest("a move")
+        for axis in self._axes:
+            if not axis.homed:
+                raise DeviceFaultError(f"{axis.name} must be homed first")
+        self._enable(PROFILE_POSITION)
+        for axis in self._axes:
+            axis.set_speed(speed)
+        for axis, angle in zip(self._axes, (azimuth, elevation), strict=True):
+            axis.offer(round(angle * axis.units))
+        self._await_both(lambda axis: axis.activity is not Activity.OFFERED, "taken the set-point")
+        self._refresh()
+
+    def state(self) -> StageState:
+        """Service both axes and return the newest state. Never waits.
+
+        Raises
+        ------
+        LinkError
+            If the bus is lost.
+        DeviceTimeoutError
+            If the heartbeat of an axis has stopped.
+        DeviceFaultError
+            If a drive was reset.
+        """
+        heard = [axis.take_in() for axis in self._axes]
+        for axis in self._axes:
+            axis.node.check_alive()
+        if any(axis.fault for axis in self._axes):
+            self._stop_moving()
+        if self._state is None or any(heard):
+            self._refresh()
+        if self._state is None:
+            raise LinkError(f"{self._names} have told no state yet: connect first")
+        return self._state
+
+    def stop(self) -> None:
+        """Bring both axes to rest at the quick stop ramp; returns while they still slow down.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            If a drive does not leave OPERATION ENABLED within a second; without heartbeats it stops by itself.
+        """
+        if not self._connected:
+            raise LinkError(f"{self._names} are not connected")
+        self._stop(STOP_ATTEMPTS)
+        self._refresh()
+
+    def clear_fault(self) -> None:
+        """Reset latched faults, on the operator's word alone. Never moves, and leaves the drives without power.
+
+        Raises
+        ------
+        DeviceFaultError
+            If an axis still moves, or the cause of its fault is still there.
+        """
+        for axis in self._axes:
+            axis.reset_fault(self._waiter(axis))
+        for axis in self._axes:
+            if axis.activity is Activity.REST:
+                axis.see_homed(self._waiter(axis))
+        self._refresh()
+
+    def close(self) -> None:
+        """Stop the stage if the bus still lives, take the power off drives at rest, and release the bus."""
+        try:
+            if self._connected:
+                self._stop(6)
+                for axis in self._axes:
+                    if axis.activity is Activity.REST and axis.state is DriveState.OPERATION_ENABLED:
+                        axis.control(Control.DISABLE_VOLTAGE)
+                    axis.node.remote.nmt.state = "PRE-OPERATIONAL"
+        except DeviceError:
+            pass  # without heartbeats the drives stop by themselves
+        finally:
+            self._connected = False
+            for axis in self._axes:
+                axis.node.close()
+
+    # How both axes are one stage
+
+    @property
+    def _names(self) -> str:
+        return " and ".join(axis.name for axis in self._axes)
+
+    def _identity(self, identities: list[DeviceIdentity]) -> DeviceIdentity:
+        """Return two drives as one device."""
+        first, second = identities
+        numbers = dict.fromkeys((first.serial_number, second.serial_number))
+        return DeviceIdentity(
+            kind="stage",
+            model=first.model,
+            serial_number=", ".join(numbers),
+            firmware_version=first.firmware_version,
+            protocol=first.protocol,
+            boot_count=first.boot_count,
+        )
+
+    def _read_limits(self) -> StageLimits:
+        azimuth, elevation = (setup.limits_of(axis, self._own_limits) for axis in self._axes)
+        return StageLimits(
+            azimuth_min=azimuth[0],
+            azimuth_max=azimuth[1],
+            elevation_min=elevation[0],
+            elevation_max=elevation[1],
+            max_speed=min(azimuth[2], elevation[2]),
+            max_acceleration=min(azimuth[3], elevation[3]),
+        )
+
+    def _refresh(self) -> None:
+        """Make the state anew from what the axes have told."""
+        azimuth, elevation = self._axes
+        told_ms = [axis.device_time_ms for axis in self._axes if axis.device_time_ms is not None]
+        now = self._clock.now()
+        self._state = StageState(
+            device_time=max(told_ms) / 1000 if told_ms else now,
+            arrival_time=now,
+            mode=self._mode(),
+            azimuth=azimuth.position / azimuth.units,
+            elevation=elevation.position / elevation.units,
+            azimuth_rate=azimuth.velocity / azimuth.speed_units,
+            elevation_rate=elevation.velocity / elevation.speed_units,
+            in_position=azimuth.in_position and elevation.in_position,
+            fault=self._fault(),
+        )
+
+    def _mode(self) -> StageMode:
+        if any(axis.fault for axis in self._axes):
+            return StageMode.FAULT
+        modes = {_MODES.get(axis.activity) for axis in self._axes}
+        for mode in _ORDER:
+            if mode in modes:
+                return mode
+        return StageMode.IDLE if all(axis.homed for axis in self._axes) else StageMode.NOT_HOMED
+
+    def _fault(self) -> str:
+        """Return the faults of both axes by name."""
+        faults = [axis.fault for axis in self._axes]
+        if faults[0] == faults[1]:
+            return faults[0]
+        return ", ".join(f"{fault} ({AXIS_NAMES[index]})" for index, fault in enumerate(faults) if fault)
+
+    def _stop_moving(self) -> None:
+        """Stop each axis that moves and is not being stopped."""
+        for axis in self._axes:
+            if axis.activity not in {Activity.REST, Activity.STOPPING}:
+                axis.quick_stop()
+
+    def _stop(self, attempts: int) -> None:
+        """Stop each axis that moves, and wait until its drive has heard it."""
+        self._stop_moving()
+        stopping = [axis for axis in self._axes if axis.activity is Activity.STOPPING]
+        for _ in range(attempts):
+            deadline = self._clock.now() + STOP_INTERVAL
+            while self._clock.now() < deadline:
+                if not any(axis.state is DriveState.OPERATION_ENABLED for axis in stopping):
+                    return
+                self._wait(deadline)
+            for axis in stopping:
+                axis.quick_stop()
+        if stopping:
+            raise DeviceTimeoutError(
+                f"{' and '.join(axis.name for axis in stopping)} did not stop within {attempts * STOP_INTERVAL:g} s; "
+                "press the emergency stop if it moves"
+            )
+
+    def _enable(self, mode: int) -> None:
+        for axis in self._axes:
+            axis.enable(mode, self._waiter(axis))
+
+    def _require_rest(self, what: str) -> None:
+        """Raise DeviceFaultError unless both axes are at rest without a fault."""
+        for axis in self._axes:
+            axis.take_in()
+            if axis.fault:
+                raise DeviceFaultError(f"{axis.name} refuses {what}: the fault {axis.fault} must be cleared first")
+            if axis.activity is not Activity.REST:
+                raise DeviceFaultError(f"{axis.name} refuses {what}: it must be at rest first")
+
+    def _require(self, name: str, value: float, least: float, most: float, unit: str) -> None:
+        """Raise ValueError unless `value` lies between `least` and `most`, to half a unit of the drive."""
+        half = 0.5 / min(abs(axis.units) for axis in self._axes)
+        if not least - half <= value <= most + half:
+            raise ValueError(
+                f"{name} {degrees(value):.4f} {unit} lies outside the stage's limits, "
+                f"{degrees(least):.4f} to {degrees(most):.4f} {unit}"
+            )
+
+    # Waiting, and the heartbeat that goes on meanwhile
+
+    def _await_both(self, so: Callable[[Axis], bool], what: str) -> None:
+        """Wait until something is so of both axes; stop both and raise if it does not come to that."""
+        deadline = self._clock.now() + ANSWER_TIMEOUT
+        while True:
+            missing = [axis for axis in self._axes if not so(axis)]
+            troubled = [axis for axis in self._axes if axis.fault or axis.refusal]
+            if not missing and not troubled:
+                self._refresh()
+                return
+            if troubled or self._clock.now() >= deadline:
+                self._stop_moving()
+                self._refresh()
+                raise (
+                    _trouble(troubled[0])
+                    if troubled
+                    else DeviceTimeoutError(f"{missing[0].name} has not {what} within {ANSWER_TIMEOUT:g} s")
+                )
+            self._wait(deadline)
+
+    def _waiter(self, axis: Axis, timeout: float = ANSWER_TIMEOUT) -> Callable[[Callable[[], bool], str], None]:
+        """Return what waits until something is so of an axis, and raises DeviceTimeoutError if it does not come."""
+
+        def wait(so: Callable[[], bool], what: str) -> None:
+            deadline = self._clock.now() + timeout
+            while not so():
+                if self._clock.now() >= deadline:
+                    raise DeviceTimeoutError(f"{axis.name} has not come to {what} within {timeout:g} s")
+                self._wait(deadline)
+
+        return wait
+
+    def _wait(self, deadline: float) -> None:
+        """Let a service period pass, or less if something comes."""
+        heard = [axis.take_in() for axis in self._axes]
+        if not any(heard):
+            self._clock.wait(min(deadline, self._clock.now() + SERVICE_PERIOD))
+            for axis in self._axes:
+                axis.take_in()
+
+    def _beat(self) -> None:
+        """Send the host's heartbeat if it is time; so before anything new is looked at."""
+        if not self._connected:
+            return
+        now = self._clock.now()
+        newest_ms = max(axis.device_time_ms or 0 for axis in self._axes)
+        told = newest_ms - self._beaten_ms >= HEARTBEAT_SPAN_MS
+        if told or now - self._beaten_at >= HEARTBEAT_PERIOD:
+            self._beaten_at = now
+            self._axes[0].node.send(0x700 + setup.HOST_NODE, b"\x05")
+        if told:
+            self._beaten_ms = newest_ms
+            for axis in self._axes:
+                axis.acknowledge()
+
+
+def _trouble(axis: Axis) -> DeviceFaultError:
+    """Return what an axis has against what it was asked."""
+    if axis.fault:
+        return DeviceFaultError(f"{axis.name} reports {axis.fault}; it stays stopped until the fault is cleared")
+    return DeviceFaultError(f"{axis.name} refused the set-point: {axis.refusal}")
