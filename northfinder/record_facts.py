@@ -19,7 +19,15 @@ class RecordFacts:
     gyro: DeviceIdentity | None  #: None if the measurement ended before it was known
     started: float  #: s since 1970, UTC
     ended: float  #: likewise
+    device_times: tuple[float, float]  #: of the first and the last block by the gyro's own clock, s since its start
     temperatures: tuple[float, float] | None  #: lowest and highest, degrees Celsius; None if none was measured
+
+    def same_turn_on(self, before: RecordFacts) -> bool:
+        """Return whether the gyro was not switched off since the record `before` this one."""
+        if self.gyro is None or before.gyro is None:
+            return False
+        same = (self.gyro.serial_number, self.gyro.boot_count) == (before.gyro.serial_number, before.gyro.boot_count)
+        return same and self.device_times[0] >= before.device_times[1]
 
     @property
     def date(self) -> dt.date:
@@ -30,11 +38,17 @@ class RecordFacts:
 def facts_of(record: Record) -> RecordFacts:
     """Return what `record` tells of itself. Raises RecordError."""
     started, ended = _times(record)
-    warm = [block.temperature for block in record.blocks() if block.temperature is not None]
+    times, warm = [], []
+    for block in record.blocks():
+        times.append(block.device_time)
+        warm += [] if block.temperature is None else [block.temperature]
+    if not times:
+        raise RecordError(f"the record {record.path} holds no samples")
     return RecordFacts(
         gyro=gyro_identity(record),
         started=started,
         ended=ended,
+        device_times=(times[0], times[-1]),
         temperatures=(min(warm), max(warm)) if warm else None,
     )
 

@@ -23,6 +23,7 @@ _COMMANDS = {
     "plan": "Predict what each plan gives in a given time.",
     "budget": "Predict what a fix will owe its uncertainty to.",
     "solve": "Estimate again from a record, or from a table of measurements.",
+    "stats": "Show what a campaign of measurements says of the instrument.",
     "calibrate": "Find an instrument's constants where the truth is known.",
     "allan": "Identify a gyro's noise from a recording at rest.",
     "emulate": "Serve an emulated gyro and stage.",

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import click
 import msgspec
@@ -55,6 +55,9 @@ Device = TypeVar("Device", Gyro, Stage)
 )
 @click.option("--azimuth", "azimuth_deg", type=float, metavar="DEG", help="Roughly known azimuth, for the plan double.")
 @click.option("--dwell", "dwell_s", type=click.FloatRange(min=1), metavar="S", help="Dwell of six or four positions.")
+@click.option(
+    "--repeat", type=click.IntRange(min=1), default=1, metavar="N", help="Measure N times, and compare the fixes."
+)
 @click.option("--out", type=click.Path(path_type=Path), default=Path("records"), show_default=True, metavar="DIR")
 @click.option("--quiet", is_flag=True, help="Show no progress.")
 @click.option("--sim-azimuth", type=float, default=33.0, show_default=True, metavar="DEG", help="The emulator's truth.")
@@ -62,6 +65,7 @@ Device = TypeVar("Device", Gyro, Stage)
 @click.option("--sim-profile", default="tvg43", show_default=True, metavar="NAME|FILE", help="The emulated gyro.")
 @click.option("--seed", type=click.IntRange(min=0), help="Of the emulated noise; random if not given.")
 @click.option("--speed", default="1", show_default=True, metavar="X|max", help="Emulator's speed over real time.")
+@click.option("--bus", type=click.Choice(["socketcand", "slcan"]), help="Emulate a CAN bus instead of serial lines.")
 @estimation_options
 def command(
     *,
@@ -73,6 +77,7 @@ def command(
     until_sd_deg: float | None,
     azimuth_deg: float | None,
     dwell_s: float | None,
+    repeat: int,
     out: Path,
     quiet: bool,
     sim_azimuth: float,
@@ -80,6 +85,7 @@ def command(
     sim_profile: str,
     seed: int | None,
     speed: str,
+    bus: str | None,
     latitude_deg: float | None,
     latitude_sd_deg: float,
     calibration_file: Path | None,
@@ -108,6 +114,7 @@ def command(
             profile=sim_profile,
             seed=secrets.randbits(32) if seed is None else seed,
             speed=speed,
+            bus=bus or "",
         )
         # The addresses follow once the emulator runs, which is only started for a command that is right otherwise.
         config = Config(gyro=GyroTable(address="", profile=sim_profile), stage=StageTable(address=""))
@@ -133,26 +140,51 @@ def command(
             config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
         stop_requested = stack.enter_context(_stop_on_signal(clock))
         display = stack.enter_context(DisplayContext(clock, quiet=quiet))
-        measurement = Measurement(
-            open_gyro=lambda: checked(
-                _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate), calibration, today
-            ),
-            open_stage=lambda: _opened(
-                open_stage, config.stage.address, clock, baudrate=config.stage.baudrate, limits=config.stage.limits()
-            ),
-            plan=course,
-            settle=wanted.settle_s,
-            assumptions=assumptions,
-            record=_record_path(out),
-            meta={"northfinder": version("northfinder"), "config": config, "simulation": truth},
-        )
-        outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
-    result = outcome.to_json() | {"plan": course.name, "wall_s": round(time.monotonic() - started, 3)}
+        results: list[dict[str, Any]] = []
+        for _ in range(repeat):
+            begun = time.monotonic() if results else started
+            measurement = Measurement(
+                open_gyro=lambda: checked(
+                    _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate), calibration, today
+                ),
+                open_stage=lambda: _opened(
+                    open_stage,
+                    config.stage.address,
+                    clock,
+                    baudrate=config.stage.baudrate,
+                    limits=config.stage.limits(),
+                    **config.stage.options(),
+                ),
+                plan=course,
+                settle=wanted.settle_s,
+                assumptions=assumptions,
+                record=_record_path(out),
+                meta={"northfinder": version("northfinder"), "config": config, "simulation": truth},
+            )
+            outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
+            results.append(outcome.to_json() | {"plan": course.name, "wall_s": round(time.monotonic() - begun, 3)})
+    _show(results, None if truth is None else (truth.azimuth_deg, truth.latitude_deg), as_json=as_json)
+    for result in results:
+        require_trustworthy(result)
+
+
+def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, as_json: bool) -> None:
+    """Print the only result, or the summary of a campaign."""
+    if len(results) == 1:
+        if as_json:
+            print_json(results[0])
+        else:
+            print_result(results[0], truth=truth)
+        return
+    from northfinder.campaign import gather, read_member  # noqa: PLC0415  # only a campaign needs it
+    from northfinder.campaign_report import campaign_json  # noqa: PLC0415
+    from northfinder.cli.stats import print_campaign  # noqa: PLC0415
+
+    summary = campaign_json(gather([read_member(Path(result["record"])) for result in results]))
     if as_json:
-        print_json(result)
+        print_json({"fixes": results, "campaign": summary})
     else:
-        print_result(result, truth=None if truth is None else (truth.azimuth_deg, truth.latitude_deg))
-    require_trustworthy(result)
+        print_campaign(summary)
 
 
 def _wishes(

@@ -11,6 +11,8 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 
+_NO_GAP = 1e-3  # a gap that is none, in whatever unit of days, hours or seconds
+
 
 def circular_mean(angles: ArrayLike, weights: ArrayLike | None = None) -> float:
     """Return the weighted mean of angles that lie within half a turn, rad, in [-pi, pi].
@@ -150,4 +152,4 @@ def longest_gap(gaps: ArrayLike, *, least: float | None = None) -> int | None:
         return int(found[0]) if found.size else None
     index = int(np.argmax(times))
     others = np.delete(times, index)
-    return index if others.size and times[index] > 10.0 * np.median(others) > 0.0 else None
+    return index if others.size and times[index] > 10.0 * max(float(np.median(others)), _NO_GAP) else None
