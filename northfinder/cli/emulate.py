@@ -49,7 +49,7 @@ from sim_device.server import ServeOptions, parse_speed, serve
     metavar="[HOST]",
     help="Serve TCP instead of pseudo-terminals, on the loopback interface unless HOST says otherwise.",
 )
-@click.option("--bus", type=click.Choice(BUSES), default="", help="Serve a CAN bus instead of serial lines.")
+@click.option("--bus", type=click.Choice(BUSES), help="Serve a CAN bus instead of serial lines.")
 @click.option("--bitrate", type=int, default=BITRATE, show_default=True, help="Of the CAN bus, bit/s.")
 @click.option("--fault", "faults", multiple=True, metavar="FAULT", help="As stage:e-stop@30; may be repeated.")
 def command(
@@ -61,7 +61,7 @@ def command(
     tilt_arcsec: tuple[float, float],
     speed: str,
     tcp: str,
-    bus: str,
+    bus: str | None,
     bitrate: int,
     faults: tuple[str, ...],
 ) -> None:
@@ -82,7 +82,7 @@ def command(
                 tilt_arcsec=tilt_arcsec,
                 speed=parse_speed(speed),
                 tcp=tcp,
-                bus=bus,
+                bus=bus or "",
                 bitrate=bitrate,
                 faults=faults,
             )
