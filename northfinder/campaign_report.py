@@ -1,4 +1,4 @@
-"""The tables of a campaign as plain data: (5) to (7) and (9) to (15) of [S2] (docs/method.md, section 7)."""
+"""The tables of a campaign as plain data: (5) to (7) and (9) to (15) of [S2] (docs/method.md, section 10)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The uncertainty budget of a fix, in the form of the GUM (JCGM 100:2008, 5.1): who contributes, how much, how known.
+"""The uncertainty budget of a fix, in the form of the GUM (JCGM 100:2008, 5.1; docs/method.md, section 8).
 
 Each contribution is a standard uncertainty of a quantity times how strongly azimuth and latitude follow it; the root of
 the sum of their squares is the standard deviation that the fix states.

@@ -1,4 +1,4 @@
-"""Constants of an instrument from measurements where the truth is known (docs/method.md, section 6).
+"""Constants of an instrument from measurements where the truth is known (docs/method.md, section 9).
 
 Two models explain why the vertical plane reads otherwise than the horizontal one. With the earth's horizontal and
 vertical rate ``Omega cos lat`` and ``Omega sin lat``, the measured ``H = hypot(N, E)`` and ``V`` are
