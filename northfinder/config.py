@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from drivers.api import StageLimits
+from northfinder.errors import ConfigError
 from northfinder.toml import read_toml
 
 
@@ -17,6 +19,22 @@ class GyroTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     address: str
     profile: str | None = None
     baudrate: int = 921600
+
+
+class DriveTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """``[stage.drive]``: how the drives of a CiA 402 stage are used; see `drivers.cia402.options.DriveOptions`."""
+
+    azimuth_units_per_turn: float | None = None
+    elevation_units_per_turn: float | None = None
+    speed_units: float | None = None
+    acceleration_units: float | None = None
+    acceleration_deg_s2: float | None = None
+    homing_method: int | None = None
+    home_speed_deg_s: float | None = None
+    home_creep_deg_s: float | None = None
+    azimuth_home_offset_deg: float = 0.0
+    elevation_home_offset_deg: float = 0.0
+    quick_stop: int = 6
 
 
 class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
@@ -29,6 +47,35 @@ class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
     elevation_min_deg: float = -math.inf
     elevation_max_deg: float = math.inf
     max_speed_deg_s: float = math.inf
+    drive: DriveTable | None = None
+
+    def options(self) -> dict[str, Any]:
+        """Return what the stage's driver takes beyond baudrate and limits. Raises ConfigError if it takes no such."""
+        if self.drive is None:
+            return {}
+        if not self.address.startswith("cia402-stage:"):
+            raise ConfigError(f"[stage.drive] is for a cia402-stage, not for {self.address}")
+        from drivers.cia402 import DriveOptions  # noqa: PLC0415  # heavy, and only these stages need it
+
+        drive = self.drive
+        try:
+            options = DriveOptions(
+                units_per_turn=(drive.azimuth_units_per_turn, drive.elevation_units_per_turn),
+                speed_units=drive.speed_units,
+                acceleration_units=drive.acceleration_units,
+                acceleration=_radians(drive.acceleration_deg_s2),
+                homing_method=drive.homing_method,
+                home_speed=_radians(drive.home_speed_deg_s),
+                home_creep=_radians(drive.home_creep_deg_s),
+                home_offset=(
+                    math.radians(drive.azimuth_home_offset_deg),
+                    math.radians(drive.elevation_home_offset_deg),
+                ),
+                quick_stop=drive.quick_stop,
+            )
+        except ValueError as error:
+            raise ConfigError(f"[stage.drive]: {error}") from None
+        return {"drive": options}
 
     def limits(self) -> StageLimits:
         """Return the limits in rad; infinite where the device's own are to hold."""
@@ -64,3 +111,7 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=Tr
 def read_config(path: Path) -> Config:
     """Read a bench's configuration. Raises ConfigError naming the file, the key, what was found and expected."""
     return read_toml(path, Config)
+
+
+def _radians(angle_deg: float | None) -> float | None:
+    return None if angle_deg is None else math.radians(angle_deg)

@@ -73,6 +73,11 @@ class Seat:
         """Device time of the newest status of a stage that its host has to acknowledge, -1 if there is none."""
         return -1
 
+    @property
+    def rests(self) -> bool:
+        """Whether the device tells its status as one at rest, though another part of the stage may move."""
+        return False
+
     def serve(self) -> None:
         """Let the device do what is due now."""
         raise NotImplementedError

@@ -76,6 +76,11 @@ class Seated(Seat):
         """Device time of the newest status of an axis, -1 if there is none."""
         return self.node.told_time_us if isinstance(self.node, AxisNode) else -1
 
+    @property
+    def rests(self) -> bool:
+        """Whether it is an axis at rest."""
+        return isinstance(self.node, AxisNode) and not self.node.drive.in_motion
+
     def hear(self, identifier: int, data: bytes) -> None:
         """Take a frame from the wire, now."""
         if self.node.accepts(identifier) and self._passes():

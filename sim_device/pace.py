@@ -107,4 +107,4 @@ class Pace:
             return -math.inf if awaited else math.inf
         if line.told_us > seen_us:
             return -math.inf
-        return line.epoch_us + seen_us + (MOVING_WINDOW_US if self._moves() else REST_WINDOW_US)
+        return line.epoch_us + seen_us + (MOVING_WINDOW_US if self._moves() and not line.rests else REST_WINDOW_US)

@@ -164,18 +164,26 @@ class Node:
         if self.state != OPERATIONAL:
             raise DeviceFaultError(f"{self.name} has left OPERATIONAL: another host commands it")
 
+    def order(self, state: str) -> None:
+        """Command an NMT state by canopen's name for it; the heartbeat tells later whether the node is there."""
+        self.state = -1
+        self.remote.nmt.state = state
+
+    def stands_in(self, code: int) -> bool:
+        """Return whether a heartbeat since the last `order` has told an NMT state."""
+        return self.state == code
+
     def command(self, state: str, code: int) -> None:
-        """Command an NMT state by canopen's name for it, and wait until a heartbeat tells it.
+        """Order an NMT state, and wait until a heartbeat tells it.
 
         Raises
         ------
         DeviceTimeoutError
             If the node does not go there.
         """
-        self.state = -1
-        self.remote.nmt.state = state
+        self.order(state)
         deadline = self._clock.now() + _STATE_TIMEOUT
-        while self.state != code:
+        while not self.stands_in(code):
             if self._clock.now() >= deadline:
                 raise DeviceTimeoutError(f"{self.name} has not become {state} within {_STATE_TIMEOUT:g} s")
             self.wait(deadline)

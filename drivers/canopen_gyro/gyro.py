@@ -13,7 +13,6 @@ from drivers.protocol.native import RATE_LSB
 EDS = "gyro.eds"
 MAX_SILENCE = 1.0  # s without samples, or five blocks if that is longer
 BLOCK_TIME = 0.2  # s, of a gyro that sends its samples in shorter bursts
-SEEN_SPAN = 0.1  # s of samples after which the device is told that they were read
 IDENTIFIERS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x500, 0x580, 0x700)  #: to which the node's number is added
 
 _SAMPLE_RATE, _RANGE, _N_AXES, _BURST, _SLOW_PERIOD, _STREAM = 0x2010, 0x2011, 0x2012, 0x2013, 0x2014, 0x2020
@@ -61,7 +60,7 @@ class CanopenGyro:
         node.duty = self._acknowledge
         self._wanted = {_SAMPLE_RATE: round((sample_rate or 0.0) * 1000), _BURST: block_samples or 0}
         self._sample_rate = self._range = 0.0
-        self._n_axes = self._block_samples = 0
+        self._n_axes = self._burst = self._block_samples = 0
         self._assembler = SampleAssembler(1, 1.0, 1)
         self._streaming = False
         self._n_acknowledged = 0
@@ -102,7 +101,7 @@ class CanopenGyro:
         """
         node = self._node
         self._streaming, self._failure = False, None
-        node.remote.nmt.state = "PRE-OPERATIONAL"  # which stops a stream
+        node.order("PRE-OPERATIONAL")  # which stops a stream
         who = identify(node, "gyro")
         self._configure()
         node.write(0x1017, 0, HEARTBEAT_MS, verify=True)
@@ -163,7 +162,7 @@ class CanopenGyro:
             if self._streaming:
                 self._node.write(_STREAM, 0, 0)
             if self._n_axes:
-                self._node.remote.nmt.state = "PRE-OPERATIONAL"
+                self._node.order("PRE-OPERATIONAL")
         except DeviceError:
             pass  # the link is on its way out; an unread gyro does no harm
         finally:
@@ -177,6 +176,7 @@ class CanopenGyro:
             if value:
                 node.write(index, 0, value, verify=True)
         rate, burst, self._n_axes = node.read(_SAMPLE_RATE), node.read(_BURST), node.read(_N_AXES)
+        self._burst = burst
         if self._n_axes not in {1, 3} or not rate or not burst:
             raise ProtocolError(
                 f"{node.name} reports an impossible configuration: {self._n_axes} axes, {rate} mHz, "
@@ -225,9 +225,9 @@ class CanopenGyro:
             raise DeviceTimeoutError(f"{node.name} is alive but has sent no samples for {silence:.1f} s")
 
     def _acknowledge(self) -> None:
-        """Tell the device what has been read, once enough has; so before anything new is looked at."""
+        """Tell the device what has been read, a burst at a time; so before anything new is looked at."""
         n_seen = self._assembler.n_seen
-        if self._streaming and n_seen - self._n_acknowledged >= SEEN_SPAN * self._sample_rate:
+        if self._streaming and n_seen - self._n_acknowledged >= self._burst:
             self._n_acknowledged = n_seen
             self._node.send(self._seen_codec.cob_id, self._seen_codec.encode({_SEEN: n_seen}))
 

@@ -12,7 +12,7 @@ from enum import Enum
 from functools import partial
 
 from drivers.api import Clock, FrameLink
-from drivers.canopen.node import OPERATIONAL, Node, load_dictionary
+from drivers.canopen.node import Node, load_dictionary
 from drivers.canopen.pdo import PdoCodec
 from drivers.cia402.options import DriveOptions
 from drivers.cia402.words import (
@@ -86,7 +86,8 @@ class Axis:
         self._cause = ""  # what the newest EMCY named
         self.refusal = ""  #: why the last set-point was refused
         self.statusword = self.position = self.velocity = 0  #: newest, in units of the drive
-        self.device_time_ms: int | None = None
+        self.device_time_ms: int | None = None  #: newest, None for a drive that tells none
+        self._seen_ms: int | None = None
         self._clock = clock
         self._target = 0
         self._speed = 0
@@ -191,9 +192,10 @@ class Axis:
             self.control(Control.QUICK_STOP)
 
     def acknowledge(self) -> None:
-        """Tell a drive that has such an object what device time has been read."""
-        if self.device_time_ms is not None:
-            self.node.send(self._seen_codec.cob_id, self._seen_codec.encode({_TIME_SEEN: self.device_time_ms}))
+        """Tell a drive that has such an object what device time has been read, if that is news."""
+        if self.device_time_ms != self._seen_ms:
+            self._seen_ms = self.device_time_ms
+            self.node.send(self._seen_codec.cob_id, self._seen_codec.encode({_TIME_SEEN: self._seen_ms or 0}))
 
     # What waits
 
@@ -268,11 +270,6 @@ class Axis:
             self.control(Control.DISABLE_VOLTAGE)
         self.fault = self._cause = ""
         self.node.emergencies.clear()
-
-    def start_node(self) -> None:
-        """Let PDOs pass."""
-        self.node.command("OPERATIONAL", OPERATIONAL)
-        self.node.watch()
 
     def _reached(self, state: DriveState) -> bool:
         if self.state in FAULTY:

@@ -53,7 +53,7 @@ def meet(axis: Axis) -> DeviceIdentity:
 def bring_to_rest(axis: Axis, wait: Wait) -> None:
     """Stop a drive that another host has left moving, and take its power away. A latched fault stays."""
     axis.read_status()
-    axis.node.remote.nmt.state = "PRE-OPERATIONAL"
+    axis.node.order("PRE-OPERATIONAL")
     if axis.state in FAULTY:
         return
     if axis.state is DriveState.OPERATION_ENABLED:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from math import degrees
 
 from drivers.api import Clock, DeviceIdentity, FrameLink, SelfTest, StageLimits, StageMode, StageState
 from drivers.canopen.identity import run_self_test
-from drivers.canopen.node import SERVICE_PERIOD
+from drivers.canopen.node import OPERATIONAL, SERVICE_PERIOD
 from drivers.cia402 import setup
 from drivers.cia402.axis import AXIS_NAMES, Activity, Axis
 from drivers.cia402.options import DriveOptions
@@ -105,7 +106,10 @@ class Cia402Stage:
         self._limits = self._read_limits()
         self._connected = True
         for axis in self._axes:
-            axis.start_node()
+            axis.node.order("OPERATIONAL")
+        for axis in self._axes:
+            self._waiter(axis)(partial(axis.node.stands_in, OPERATIONAL), "OPERATIONAL")
+            axis.node.watch()
         self._refresh()
         return self._identity(identities)
 
@@ -219,7 +223,7 @@ class Cia402Stage:
                 for axis in self._axes:
                     if axis.activity is Activity.REST and axis.state is DriveState.OPERATION_ENABLED:
                         axis.control(Control.DISABLE_VOLTAGE)
-                    axis.node.remote.nmt.state = "PRE-OPERATIONAL"
+                    axis.node.order("PRE-OPERATIONAL")
         except DeviceError:
             pass  # without heartbeats the drives stop by themselves
         finally:
@@ -383,14 +387,11 @@ class Cia402Stage:
             return
         now = self._clock.now()
         newest_ms = max(axis.device_time_ms or 0 for axis in self._axes)
-        told = newest_ms - self._beaten_ms >= HEARTBEAT_SPAN_MS
-        if told or now - self._beaten_at >= HEARTBEAT_PERIOD:
-            self._beaten_at = now
+        if newest_ms - self._beaten_ms >= HEARTBEAT_SPAN_MS or now - self._beaten_at >= HEARTBEAT_PERIOD:
+            self._beaten_at, self._beaten_ms = now, newest_ms
             self._axes[0].node.send(0x700 + setup.HOST_NODE, b"\x05")
-        if told:
-            self._beaten_ms = newest_ms
-            for axis in self._axes:
-                axis.acknowledge()
+        for axis in self._axes:
+            axis.acknowledge()
 
 
 def _trouble(axis: Axis) -> DeviceFaultError:

@@ -23,6 +23,7 @@ class SimulationOptions:
     profile: str
     seed: int
     speed: str
+    bus: str = ""  #: "socketcand" or "slcan" for a CAN bus, serial lines if empty
 
 
 class EmulatorProcess:
@@ -35,6 +36,7 @@ class EmulatorProcess:
                 sys.executable, "-m", "sim_device", "--parent-death",
                 "--azimuth", repr(options.azimuth_deg), "--latitude", repr(options.latitude_deg),
                 "--profile", options.profile, "--seed", str(options.seed), "--speed", options.speed,
+                *(("--bus", options.bus) if options.bus else ()),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
