@@ -284,3 +284,10 @@ def test_solve_help_names_its_options() -> None:
     """The help of a command shows an example."""
     assert solve_command.help is not None
     assert "northfinder solve dwells.csv" in solve_command.help
+
+
+def test_a_measurement_starts_without_what_is_slow_to_import() -> None:
+    """SciPy's statistics and the plots take a second to import, and `find` needs none of them."""
+    program = "import sys, northfinder.cli.find; print([m for m in ('scipy.stats', 'matplotlib') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

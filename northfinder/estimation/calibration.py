@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
 
 from northfinder.errors import EstimateError
 from northfinder.estimation.angles import constrain
@@ -26,6 +26,7 @@ from northfinder.estimation.campaign import circular_mean, deviations
 from northfinder.estimation.fix import Fix, Known
 from northfinder.estimation.geometry import wrapped
 from northfinder.estimation.least_squares import RESCALE_BELOW, _agreements
+from northfinder.estimation.quantiles import chi_square, chi_square_tail
 from northfinder.units import EARTH_RATE
 
 Array = NDArray[np.float64]
@@ -77,7 +78,7 @@ class ModelFit:
     @property
     def probability(self) -> float | None:
         """Probability of a chi square at least as large if the model is right, None without degrees of freedom."""
-        return float(stats.chi2.sf(self.chi2, self.dof)) if self.dof else None
+        return chi_square_tail(self.chi2, self.dof) if self.dof else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,7 +149,7 @@ def _fitted(readings: Sequence[Reading], design: Callable[[float], Array], latit
     measured = np.concatenate([each for each, _, _ in planes])
     found = inverse @ measured
     chi2, dof = float(np.sum((whiten @ measured - rows @ found) ** 2)), len(measured) - 2
-    rescale = chi2 / dof if dof and chi2 > stats.chi2.isf(RESCALE_BELOW, dof) else 1.0
+    rescale = chi2 / dof if dof and chi2 > chi_square(RESCALE_BELOW, dof) else 1.0
     cov = rescale * np.linalg.inv(rows.T @ rows)
     for latitude in np.unique(latitudes):  # the same wrong entry for all readings there
         turned = _LATITUDE_STEP * latitude_sd
@@ -189,7 +190,7 @@ def _azimuth_offset(readings: Sequence[Reading], azimuth_sd: float) -> tuple[flo
     weights = 1.0 / np.array(variances)
     mean = circular_mean(offsets, weights)
     chi2, dof = float(np.sum(weights * deviations(offsets, mean) ** 2)), len(offsets) - 1
-    rescale = chi2 / dof if dof and chi2 > stats.chi2.isf(RESCALE_BELOW, dof) else 1.0
+    rescale = chi2 / dof if dof and chi2 > chi_square(RESCALE_BELOW, dof) else 1.0
     variance = rescale / float(np.sum(weights)) + float(np.mean(common)) + azimuth_sd**2
     return mean, math.sqrt(variance)
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+
+from northfinder.estimation.quantiles import chi_square, chi_square_tail, variance_ratio_tail
 
 Array = NDArray[np.float64]
 
@@ -83,7 +84,7 @@ def turn_on_scatter(off: ArrayLike, turn_on: ArrayLike) -> TurnOnScatter:
         return TurnOnScatter(n_turn_ons=n_groups, within=None, between=_root(mean_square), probability=None)
     size = (n - float(np.sum(counts**2)) / n) / (n_groups - 1)
     between = _root(max(mean_square - within, 0.0) / size)
-    probability = float(stats.f.sf(mean_square / within, n_groups - 1, dof)) if within else 0.0
+    probability = variance_ratio_tail(mean_square / within, n_groups - 1, dof) if within else 0.0
     return TurnOnScatter(n_turn_ons=n_groups, within=_root(within), between=between, probability=probability)
 
 
@@ -128,9 +129,9 @@ def consistency(
     if dof < 1:
         return None
     chi2 = float(np.sum((values / sds) ** 2))
-    low, high = (math.sqrt(float(stats.chi2.ppf(p, dof)) / dof) for p in (0.025, 0.975))
+    low, high = (math.sqrt(chi_square(tail, dof) / dof) for tail in (0.975, 0.025))
     return Consistency(
-        rms=math.sqrt(chi2 / dof), chi2=chi2, dof=dof, probability=float(stats.chi2.sf(chi2, dof)), low=low, high=high
+        rms=math.sqrt(chi2 / dof), chi2=chi2, dof=dof, probability=chi_square_tail(chi2, dof), low=low, high=high
     )
 
 

@@ -1,4 +1,4 @@
-"""Quantiles of Student's t and of chi-square.
+"""Quantiles and tails of Student's t, chi-square and Fisher's F.
 
 From `scipy.special`, because `scipy.stats`, which has them too, takes most of a second to import.
 """
@@ -26,3 +26,21 @@ def chi_square(tail: float, dof: int) -> float:
     (7.815, 0.352)
     """
     return float(special.chdtri(dof, tail))
+
+
+def chi_square_tail(value: float, dof: int) -> float:
+    """Return the probability that chi-square with `dof` degrees of freedom exceeds `value`.
+
+    >>> round(chi_square_tail(7.815, 3), 3)
+    0.05
+    """
+    return float(special.chdtrc(dof, value))
+
+
+def variance_ratio_tail(ratio: float, dof: int, dof_within: int) -> float:
+    """Return the probability that Fisher's F with `dof` and `dof_within` degrees of freedom exceeds `ratio`.
+
+    >>> round(variance_ratio_tail(4.26, 2, 9), 3)
+    0.05
+    """
+    return float(special.fdtrc(dof, dof_within, ratio))
