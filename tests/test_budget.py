@@ -12,6 +12,7 @@ from simulated_means import DPH, SIX, TVG43, U1, U2, U3, U4, draw_noise, make_me
 
 from northfinder.estimation import Fix, Known, NoiseModel, RateMeans, estimate
 from northfinder.estimation.budget import Budget, Contribution, Declared, declared_variance, error_budget
+from northfinder.estimation.propagation import MANY
 from northfinder.units import ARCSEC
 
 NOISE = NoiseModel.from_field_units(**TVG43)
@@ -183,6 +184,16 @@ def test_declared_uncertainties_are_what_the_estimator_lacks() -> None:
     assert budget.latitude_sd**2 == pytest.approx((fix.latitude_sd or 0.0) ** 2 + added[1], rel=1e-5)
     nothing = declared_variance(means, fix, known=known, drift="constant", declared=Declared(), **GLS)
     assert not nothing.any()
+
+
+def test_the_budget_of_a_long_measurement_is_near() -> None:
+    """Of more means than it can propagate in a moment, longer ones stand for all: the sum is right within 3 %."""
+    means = six(positions=SIX * 24, dwell=30.0, mean=1.0)
+    assert means.n > MANY
+    fix = estimate(means, known=UNSURE, **GLS)
+    budget = error_budget(means, fix, known=UNSURE, **GLS)
+    assert budget.azimuth_sd == pytest.approx(fix.azimuth_sd, rel=0.03)
+    assert budget.latitude_sd == pytest.approx(fix.latitude_sd or 0.0, rel=0.03)
 
 
 def test_three_axes_add_up_too() -> None:
