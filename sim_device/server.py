@@ -136,8 +136,19 @@ def _run(pace: Pace, bench: World, connections: Sequence[Connection | BusConnect
             pace.advance(round((time.monotonic() - begin) * 1e6))
             for connection in connections:
                 connection.take_in(bench.now_us)
-            while not _bring_out(connections, bench.now_us) and pace.run_ahead():
+            while not _bring_out(connections, bench.now_us) and _run_ahead(pace, connections):
                 pass
+
+
+def _run_ahead(pace: Pace, connections: Sequence[Connection | BusConnection]) -> bool:
+    """Let the world run ahead; return whether anything happened.
+
+    On a bus it goes on until a host must say that it has read something: the heartbeats up to then go out together.
+    """
+    happened = ahead = pace.run_ahead()
+    while ahead and isinstance(connections[0], BusConnection):
+        ahead = pace.run_ahead()
+    return happened
 
 
 def _bring_out(connections: Sequence[Connection | BusConnection], now_us: int) -> bool:
