@@ -13,6 +13,7 @@ from simulated_means import DPH, OMEGA_DPH, TVG43, draw_noise, make_means
 
 from northfinder.errors import EstimateError
 from northfinder.estimation import Fix, Known, NoiseModel, RateMeans, estimate, solve_closed_form
+from northfinder.estimation.budget import Declared, declared_variance
 from northfinder.estimation.calibration import Constants, Reading, calibrate, with_ratio
 
 Array = NDArray[np.float64]
@@ -30,10 +31,14 @@ def means_at(latitude_deg: float, *, d_g_dph: float = DRIFT_DPH) -> RateMeans:
 
 def fixes_at(latitude_deg: float, n: int, seed: int, *, d_g_dph: float = DRIFT_DPH) -> list[Fix]:
     """Return `n` fixes with noise and nothing known."""
+    return [estimate(each, noise=NOISE, weights="generalised") for each in noisy_at(latitude_deg, n, seed, d_g_dph)]
+
+
+def noisy_at(latitude_deg: float, n: int, seed: int, d_g_dph: float = DRIFT_DPH) -> list[RateMeans]:
+    """Return `n` draws of means with noise."""
     means = means_at(latitude_deg, d_g_dph=d_g_dph)
     drawn = draw_noise(np.random.default_rng(seed), means, n, sample_rate=1.0, **TVG43)
-    noisy = [means.with_rate(means.rate[:, 0] + noise) for noise in drawn]
-    return [estimate(each, noise=NOISE, weights="generalised") for each in noisy]
+    return [means.with_rate(means.rate[:, 0] + noise) for noise in drawn]
 
 
 def reading(fix: Fix, latitude_deg: float, *, common: Array = NOTHING, offset_deg: float = 0.0) -> Reading:
@@ -139,6 +144,29 @@ def test_a_ratio_found_at_one_latitude_is_wrong_at_another() -> None:
     assert np.mean(by_ratio) == pytest.approx(2.6, abs=0.1)
     assert max(sds) < 0.3
     expect_honest(np.array(by_drift) / np.array(sds))
+
+
+def test_scale_factor_and_drift_rate_used_together_are_as_sure_as_stated() -> None:
+    """Both are used as known, and they are correlated; only with that counted are the errors as large as stated."""
+    n_runs = 100
+    at_home, abroad = fixes_at(KYIV, n_runs, seed=31), noisy_at(-10.0, n_runs, seed=32)
+    ratios, uncorrelated = [], []
+    for home, means in zip(at_home, abroad, strict=True):
+        fit = calibrate([reading(home, KYIV)]).acceleration_sensitive
+        known = Known(
+            scale_factor=fit.first, scale_factor_sd=fit.first_sd,
+            acceleration_sensitive_drift_rate=fit.second, acceleration_sensitive_drift_rate_sd=fit.second_sd,
+        )  # fmt: skip
+        fix = estimate(means, noise=NOISE, known=known, weights="generalised")
+        declared = Declared(scale_drift_correlation=fit.correlation)
+        added = declared_variance(
+            means, fix, noise=NOISE, known=known, drift="constant", weights="generalised", declared=declared
+        )
+        error = (fix.latitude or 0.0) - math.radians(-10.0)
+        ratios.append(error / math.sqrt((fix.latitude_sd or 0.0) ** 2 + added[1]))
+        uncorrelated.append(abs(added[1]) / (fix.latitude_sd or 1.0) ** 2)
+    expect_honest(np.array(ratios))
+    assert min(uncorrelated) > 0.01  # the correlation matters here
 
 
 def test_the_ratio_is_that_of_the_published_formula() -> None:
