@@ -29,6 +29,7 @@ SERVICE_PERIOD = 0.05  # s, how often a wait looks after the other duties
 MAX_WAITING = 4096  # frames of one PDO that wait for the driver
 OPERATIONAL = 5
 PRE_OPERATIONAL = 127
+_STATES = {0, 4, OPERATIONAL, PRE_OPERATIONAL}  # of a heartbeat: boot-up, stopped, these
 T = TypeVar("T")
 _ATTEMPTS = 3
 _STATE_TIMEOUT = 1.0  # s
@@ -104,10 +105,14 @@ class Node:
             if waiting is not None:
                 if len(waiting) < MAX_WAITING:
                     waiting.append(data)
-            elif self._lengths.get(identifier) == len(data):
+            elif self._lengths.get(identifier) == len(data) and not self._is_odd(identifier, data):
                 self._network.notify(identifier, bytearray(data), now)
             else:
                 self.n_malformed += 1
+
+    def _is_odd(self, identifier: int, data: bytes) -> bool:
+        """Return whether a frame is a heartbeat with a state that there is not."""
+        return identifier == 0x700 + self.id and data[0] not in _STATES
 
     def wait(self, deadline: float) -> None:
         """Service until something has come, or `deadline`, or a service period has gone by."""

@@ -7,7 +7,7 @@ from drivers.canopen.identity import identify, run_self_test
 from drivers.canopen.node import HEARTBEAT_MS, OPERATIONAL, Node, load_dictionary
 from drivers.canopen.pdo import PdoCodec
 from drivers.canopen_gyro.samples import SampleAssembler, SampleOrderError
-from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
+from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
 from drivers.protocol.native import RATE_LSB
 
 EDS = "gyro.eds"
@@ -100,7 +100,7 @@ class CanopenGyro:
             If it does not support the sample rate or burst asked for.
         """
         node = self._node
-        self._streaming, self._failure = False, None
+        self._streaming, self._failure, self._n_axes = False, None, 0
         node.order("PRE-OPERATIONAL")  # which stops a stream
         who = identify(node, "gyro")
         self._configure()
@@ -118,6 +118,8 @@ class CanopenGyro:
         """Start the sample stream; the index of its first sample is 0. A stream under way goes on."""
         if self._streaming:
             return
+        if not self._n_axes:
+            raise LinkError(f"{self._node.name} cannot start: connect first")
         self._node.service()
         self._frames()  # of a stream before
         self._assembler = SampleAssembler(self._n_axes, self._sample_rate, self._block_samples)

@@ -96,7 +96,7 @@ class Cia402Stage:
         DeviceFaultError
             If a drive refuses what it must be told.
         """
-        self._state, self._connected = None, False
+        self._state, self._limits, self._connected = None, None, False
         identities = [setup.meet(axis) for axis in self._axes]
         for axis in self._axes:
             setup.bring_to_rest(axis, self._waiter(axis, REST_TIMEOUT))
@@ -110,11 +110,12 @@ class Cia402Stage:
         for axis in self._axes:
             self._waiter(axis)(partial(axis.node.stands_in, OPERATIONAL), "OPERATIONAL")
             axis.node.watch()
-        self._refresh()
+        self._state = self._newest()
         return self._identity(identities)
 
     def self_test(self) -> SelfTest:
         """Run the self-test of drives that have one, up to 3 s each. Never moves."""
+        self._require_connected()
         failures = [
             f"{AXIS_NAMES[axis.index]}: {failure}"
             for axis in self._axes
@@ -131,6 +132,7 @@ class Cia402Stage:
         DeviceFaultError
             If a drive refuses, or is not at rest.
         """
+        self._require_connected()
         self._require_rest("homing")
         self._enable(HOMING)
         for axis in self._axes:
@@ -162,7 +164,7 @@ class Cia402Stage:
         for axis, angle in zip(self._axes, (azimuth, elevation), strict=True):
             axis.offer(round(angle * axis.units))
         self._await_both(lambda axis: axis.activity is not Activity.OFFERED, "taken the set-point")
-        self._refresh()
+        self._state = self._newest()
 
     def state(self) -> StageState:
         """Service both axes and return the newest state. Never waits.
@@ -176,15 +178,14 @@ class Cia402Stage:
         DeviceFaultError
             If a drive was reset.
         """
+        self._require_connected()
         heard = [axis.take_in() for axis in self._axes]
         for axis in self._axes:
             axis.node.check_alive()
         if any(axis.fault for axis in self._axes):
             self._stop_moving()
         if self._state is None or any(heard):
-            self._refresh()
-        if self._state is None:
-            raise LinkError(f"{self._names} have told no state yet: connect first")
+            self._state = self._newest()
         return self._state
 
     def stop(self) -> None:
@@ -195,10 +196,9 @@ class Cia402Stage:
         DeviceTimeoutError
             If a drive does not leave OPERATION ENABLED within a second; without heartbeats it stops by itself.
         """
-        if not self._connected:
-            raise LinkError(f"{self._names} are not connected")
+        self._require_connected()
         self._stop(STOP_ATTEMPTS)
-        self._refresh()
+        self._state = self._newest()
 
     def clear_fault(self) -> None:
         """Reset latched faults, on the operator's word alone. Never moves, and leaves the drives without power.
@@ -208,12 +208,13 @@ class Cia402Stage:
         DeviceFaultError
             If an axis still moves, or the cause of its fault is still there.
         """
+        self._require_connected()
         for axis in self._axes:
             axis.reset_fault(self._waiter(axis))
         for axis in self._axes:
             if axis.activity is Activity.REST:
                 axis.see_homed(self._waiter(axis))
-        self._refresh()
+        self._state = self._newest()
 
     def close(self) -> None:
         """Stop the stage if the bus still lives, take the power off drives at rest, and release the bus."""
@@ -261,12 +262,12 @@ class Cia402Stage:
             max_acceleration=min(azimuth[3], elevation[3]),
         )
 
-    def _refresh(self) -> None:
-        """Make the state anew from what the axes have told."""
+    def _newest(self) -> StageState:
+        """Return the state by what the axes have told."""
         azimuth, elevation = self._axes
         told_ms = [axis.device_time_ms for axis in self._axes if axis.device_time_ms is not None]
         now = self._clock.now()
-        self._state = StageState(
+        return StageState(
             device_time=max(told_ms) / 1000 if told_ms else now,
             arrival_time=now,
             mode=self._mode(),
@@ -322,6 +323,10 @@ class Cia402Stage:
         for axis in self._axes:
             axis.enable(mode, self._waiter(axis))
 
+    def _require_connected(self) -> None:
+        if not self._connected:
+            raise LinkError(f"{self._names} are not connected: connect first")
+
     def _require_rest(self, what: str) -> None:
         """Raise DeviceFaultError unless both axes are at rest without a fault."""
         for axis in self._axes:
@@ -349,11 +354,11 @@ class Cia402Stage:
             missing = [axis for axis in self._axes if not so(axis)]
             troubled = [axis for axis in self._axes if axis.fault or axis.refusal]
             if not missing and not troubled:
-                self._refresh()
+                self._state = self._newest()
                 return
             if troubled or self._clock.now() >= deadline:
                 self._stop_moving()
-                self._refresh()
+                self._state = self._newest()
                 raise (
                     _trouble(troubled[0])
                     if troubled
