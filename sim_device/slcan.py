@@ -132,6 +132,7 @@ class Adapter:
     def _tell_status(self, text: str) -> bytes:
         if not self.is_open or len(text) != 1:
             return NO
+        self.collect()
         status, self._status = self._status, 0
         if not self._tap.attuned:
             status |= BUS_ERROR
