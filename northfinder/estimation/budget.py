@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from northfinder.estimation.fix import Fix, Known
+from northfinder.estimation.geometry import by_tilt
 from northfinder.estimation.least_squares import Weights, _assumed_vertical
 from northfinder.estimation.linear import Drift
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
-from northfinder.estimation.propagation import Gains, Propagation, by_tilt, gains
+from northfinder.estimation.propagation import Gains, Propagation, gains
 
 Array = NDArray[np.float64]
 
@@ -183,8 +184,9 @@ def _known_lines(path: Propagation, fix: Fix, known: Known, gain: Gains, declare
     drift_sd, correlation = known.acceleration_sensitive_drift_rate_sd, declared.scale_drift_correlation
     by_scale = gain.scale_factor * known.scale_factor_sd - correlation * drift_sd * gain.rates[:, 2]
     drift_alone_sd = drift_sd * math.sqrt(1.0 - correlation**2)
+    leaning = np.add(fix.rates, [0.0, 0.0, known.acceleration_sensitive_drift_rate])
     lines = [
-        _line("tilt", known.tilt_sd, "rad", "B", (known.tilt_sd * gain.rates @ by_tilt(fix.rates)).T),
+        _line("tilt", known.tilt_sd, "rad", "B", (known.tilt_sd * gain.rates @ by_tilt(leaning)).T),
         _line("scale factor", known.scale_factor_sd, "1", "B", [by_scale]),
         _line("acceleration-sensitive drift rate", drift_alone_sd, "rad/s/g", "B", [drift_alone_sd * gain.rates[:, 2]]),
         _line("latitude entry", known.latitude_sd, "rad", "B", [known.latitude_sd * gain.latitude]),

@@ -93,12 +93,23 @@ def closures(means: RateMeans, covariance: Array, sd_dof: float) -> list[Check]:
     found: dict[str, list[tuple[float, float]]] = {"pair sums": [], "repeated positions": []}
     for axis in range(means.n_axes):
         groups = _positions(axes[:, axis])
-        contrasts = {"pair sums": _pair_sums(groups, axes[:, axis]), "repeated positions": _repeats(groups, means.n)}
-        for name, rows in contrasts.items():
-            found[name] += [
-                (float(row @ means.rate[:, axis]), math.sqrt(max(float(row @ covariance @ row), 0.0))) for row in rows
-            ]
+        contrasts = {"pair sums": _pair_sums(groups, axes[:, axis]), "repeated positions": _repeats(groups)}
+        for name, of_kind in contrasts.items():
+            found[name] += [contrast.applied(means.rate[:, axis], covariance) for contrast in of_kind]
     return [_closure(name, values, sd_dof) for name, values in found.items() if values]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Contrast:
+    """What to multiply a few of the dwell means by to get a figure that ought to be zero."""
+
+    dwells: list[int]
+    weights: Array
+
+    def applied(self, rate: Array, covariance: Array) -> tuple[float, float]:
+        """Return the figure and its standard deviation."""
+        variance = self.weights @ covariance[np.ix_(self.dwells, self.dwells)] @ self.weights
+        return float(self.weights @ rate[self.dwells]), math.sqrt(max(float(variance), 0.0))
 
 
 def _positions(axes: Array) -> list[list[int]]:
@@ -113,20 +124,19 @@ def _positions(axes: Array) -> list[list[int]]:
     return groups
 
 
-def _pair_sums(groups: list[list[int]], axes: Array) -> list[Array]:
-    """Return what to multiply dwell means by to get the differences of the half sums of opposite positions."""
+def _pair_sums(groups: list[list[int]], axes: Array) -> list[_Contrast]:
+    """Return the differences between the half sums of opposite positions."""
     opposite = [(a, b) for a, b in combinations(groups, 2) if np.linalg.norm(axes[a[0]] + axes[b[0]]) < SAME_POSITION]
-    halves = []
-    for a, b in opposite:
-        row = np.zeros(len(axes))
-        row[a], row[b] = 0.5 / len(a), 0.5 / len(b)
-        halves.append(row)
-    return [second - first for first, second in combinations(halves, 2)]
+    halves = [(a + b, np.repeat([0.5 / len(a), 0.5 / len(b)], [len(a), len(b)])) for a, b in opposite]
+    return [
+        _Contrast(first + second, np.concatenate([-of_first, of_second]))
+        for (first, of_first), (second, of_second) in combinations(halves, 2)
+    ]
 
 
-def _repeats(groups: list[list[int]], n: int) -> list[Array]:
-    """Return what to multiply dwell means by to get the change from the first to each later visit of a position."""
-    return [np.eye(n)[later] - np.eye(n)[group[0]] for group in groups for later in group[1:]]
+def _repeats(groups: list[list[int]]) -> list[_Contrast]:
+    """Return the changes from the first to each later visit of a position."""
+    return [_Contrast([group[0], later], np.array([-1.0, 1.0])) for group in groups for later in group[1:]]
 
 
 def _closure(name: str, values: list[tuple[float, float]], sd_dof: float) -> Check:

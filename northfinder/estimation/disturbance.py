@@ -28,7 +28,8 @@ def undisturbed(means: RateMeans, *, limit: float = LIMIT) -> NDArray[np.bool_]:
     judged = np.bincount(dwell)[dwell] >= ENOUGH
     if not judged.any():
         return np.ones(means.n, dtype=bool)
-    median = np.array([np.median(means.rate[dwell == i], axis=0) for i in range(dwell[-1] + 1)])
+    of_dwells = np.split(means.rate, np.flatnonzero(np.diff(dwell)) + 1)
+    median = np.array([np.median(rate, axis=0) for rate in of_dwells])
     ratio = means.duration / np.median(means.duration)
     length = np.minimum(ratio, np.sqrt(ratio))[:, np.newaxis]
     distance = np.abs(means.rate - median[dwell]) * length

@@ -81,6 +81,12 @@ def wrapped(azimuth: float) -> float:
     return turned if turned < 2.0 * math.pi else 0.0
 
 
+def by_tilt(rates: Array) -> Array:
+    """Return what one radian of tilt toward stage azimuth 0 and 90 deg makes of N, E and V, shape (3, 2)."""
+    north, east, vertical = rates
+    return np.array([[-vertical, 0.0], [0.0, vertical], [north, -east]])
+
+
 def rates_jacobian(azimuth: float, latitude: float, scale_factor: float = 1.0) -> Array:
     """Return the derivative of `rates` by (azimuth, latitude, scale factor), shape (3, 3)."""
     sin_a, cos_a = math.sin(azimuth), math.cos(azimuth)

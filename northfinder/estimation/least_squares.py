@@ -17,7 +17,7 @@ from northfinder.errors import EstimateError
 from northfinder.estimation import checks
 from northfinder.estimation.angles import constrain, horizontal_only, require_horizontal
 from northfinder.estimation.fix import Fix, Known
-from northfinder.estimation.geometry import wrapped
+from northfinder.estimation.geometry import by_tilt, wrapped
 from northfinder.estimation.linear import (
     Design,
     Drift,
@@ -41,6 +41,8 @@ MEASURES_VERTICAL = 0.05
 #: The scale factor is taken to lie this near 1 where it is not known and the earth's vertical rate must be assumed.
 _SCALE_FACTOR_SD = 0.1
 _NO_VERTICAL = "no position turns the input axis up or down, so the vertical earth rate was not measured"
+#: Opposite and repeated positions are compared among so many dwells, the first ones: their covariance is dense.
+MAX_CLOSURES = 400
 _UNKNOWN = Known()
 
 
@@ -198,9 +200,9 @@ def _assumed_vertical(known: Known) -> tuple[float, float]:
 def _earth_rates(fit: _Fit, known: Known) -> tuple[Array, Array]:
     """Return N, E, V and their covariance, with the acceleration-sensitive drift and the tilt's error allowed for."""
     nev = fit.coefficients[:3] - np.array([0.0, 0.0, known.acceleration_sensitive_drift_rate])
-    north, east, vertical = nev
-    by_tilt = np.array([[-vertical, 0.0], [0.0, vertical], [north, -east]])
-    cov = fit.covariance[:3, :3] + known.tilt_sd**2 * by_tilt @ by_tilt.T
+    # The drift leans with the rotation axis, as the earth's rate does, so the fit before its removal is what turns.
+    leaning = by_tilt(fit.coefficients[:3])
+    cov = fit.covariance[:3, :3] + known.tilt_sd**2 * leaning @ leaning.T
     cov[2, 2] += known.acceleration_sensitive_drift_rate_sd**2
     return nev, cov
 
@@ -232,8 +234,10 @@ def _checks(
 ) -> list[checks.Check]:
     """Return the checks beside that of the horizontal rate; `residuals` are the means of the fit's residuals."""
     dwells = residuals.per_dwell()
+    dwells = dwells.select(np.arange(dwells.n) < MAX_CLOSURES)
     if noise is None:
-        per_mean = np.bincount(np.searchsorted(dwells.start, residuals.start, side="right") - 1)
+        in_dwells = residuals.start < dwells.start[-1] + dwells.duration[-1]
+        per_mean = np.bincount(np.searchsorted(dwells.start, residuals.start[in_dwells], side="right") - 1)
         dwell_cov = np.diag(fit.chi2 / fit.dof / per_mean)
     else:
         dwell_cov = noise.covariance(dwells)

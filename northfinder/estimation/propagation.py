@@ -176,12 +176,6 @@ class Propagation:
         return self.through(np.stack(columns, axis=2))
 
 
-def by_tilt(rates: Array) -> Array:
-    """Return what one radian of tilt toward stage azimuth 0 and 90 deg makes of N, E and V, shape (3, 2)."""
-    north, east, vertical = rates
-    return np.array([[-vertical, 0.0], [0.0, vertical], [north, -east]])
-
-
 def _rows(design: Design, noise: NoiseModel | None) -> tuple[Array, Array]:
     """Return design and rates, whitened if there is a noise."""
     rate = design.means.rate
