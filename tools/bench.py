@@ -3,6 +3,8 @@
 find     wall time and memory of a whole ``find --speed max``, both processes' start included
 decode   bytes of the wire to arrays
 live     processor time of transport, driver and record at 2,000 samples/s of three axes
+estimate time of an estimate from 16 min and from 24 h of 1 s means
+plan     wall time of ``northfinder plan`` with its plot
 help     wall time of ``northfinder --help``
 """
 
@@ -28,7 +30,10 @@ from drivers.protocol.native import decode_samples
 from drivers.transport.clock import SystemClock
 from drivers.transport.virtual import VirtualClock, VirtualLink
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
+from northfinder.estimation import RateMeans
 from northfinder.recorder import Recorder
+from northfinder.solution import Assumptions, solve
+from northfinder.units import DPH
 from sim_device.bench import SimBench
 
 #: What the project promises; the figures are printed beside them.
@@ -37,6 +42,9 @@ LIMITS = {
     "find_memory_mb": 150.0,
     "decode_samples_per_s": 1e6,
     "live_cpu_percent": 5.0,
+    "estimate_16_min_s": 0.03,
+    "estimate_24_h_s": 2.0,
+    "plan_wall_s": 5.0,
     "help_wall_s": 0.5,
 }
 LIVE_SECONDS = 20.0
@@ -136,6 +144,40 @@ def bench_live() -> dict[str, float]:
     return {"live_cpu_percent": 100 * cpu / wall, "live_samples_per_s": rate, "live_samples_lost": lost}
 
 
+def four_positions(seconds: int) -> RateMeans:
+    """Return means of 1 s on four positions in turn, 27 s each and 3 s a turn, with white noise."""
+    second = np.arange(seconds)
+    dwell = second // 27
+    rate = 38 * DPH + 9 * DPH * np.cos(dwell * np.pi / 2 + 0.5) + np.random.default_rng(1).normal(0, DPH, seconds)
+    return RateMeans(
+        start=second + 3.0 * dwell, duration=np.ones(seconds), rate=rate, azimuth=dwell % 4 * np.pi / 2,
+        elevation=np.zeros(seconds), dwell=dwell, n_samples=np.full(seconds, 235),
+    )  # fmt: skip
+
+
+def bench_estimate() -> dict[str, float]:
+    """Time the estimate of a whole measurement and of a day, disturbed seconds looked for and all checks made."""
+    assumptions = Assumptions.gather(method="generalised", profile="tvg43", latitude_deg=50.0, g_drift_dph=None)
+    figures = {}
+    for name, seconds, n_runs in (("estimate_16_min_s", 960, 20), ("estimate_24_h_s", 86_400, 3)):
+        means = four_positions(seconds)
+        times = []
+        for _ in range(n_runs):
+            started = time.perf_counter()
+            solve(means, assumptions)
+            times.append(time.perf_counter() - started)
+        figures[name] = statistics.median(times)
+    return figures
+
+
+def bench_plan() -> dict[str, float]:
+    """Time the search for the best plan of 16 min, latitude included, with its plot."""
+    with tempfile.TemporaryDirectory() as folder:
+        plot = str(Path(folder) / "plan.svg")
+        command = ["plan", "--profile", "tvg43", "--time", "960", "--need-latitude", "--plot", plot]
+        return {"plan_wall_s": run_timed(command)[0]}
+
+
 def bench_help() -> dict[str, float]:
     """Time the help page."""
     return {"help_wall_s": statistics.median(run_timed(["--help"])[0] for _ in range(5))}
@@ -145,6 +187,8 @@ BENCHES: dict[str, Callable[[], dict[str, float]]] = {
     "find": bench_find,
     "decode": bench_decode,
     "live": bench_live,
+    "estimate": bench_estimate,
+    "plan": bench_plan,
     "help": bench_help,
 }
 
