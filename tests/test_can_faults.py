@@ -1,4 +1,4 @@
-"""What goes wrong on a CAN bus, in virtual time: named errors or clean runs, never a wrong sample; and frames at random."""
+"""What goes wrong on a CAN bus, in virtual time: a named error or a clean run, never a wrong sample; random frames."""
 
 from __future__ import annotations
 

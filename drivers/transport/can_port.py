@@ -15,6 +15,7 @@ from drivers.transport.can_frames import ERROR, EXTENDED_MASK, REMOTE, Frame
 
 SEND_TIMEOUT = 1.0  # s
 _BATCH = 512  # frames a read at most
+_NO_DRIVER = (ImportError, NotImplementedError, AttributeError, NameError)  # what the makers' missing libraries lead to
 
 # Its warnings are about what here becomes an exception or a count; without a handler they would go to the terminal.
 logging.getLogger("can").addHandler(logging.NullHandler())
@@ -44,7 +45,7 @@ class PythonCanPort:
         options: dict[str, Any] = {"bitrate": address.bitrate} if address.interface in SET_BITRATE else {}
         try:
             self._bus = can.Bus(channel, interface=address.interface, **options)
-        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError, AttributeError) as error:
+        except (can.CanError, OSError, ValueError, *_NO_DRIVER) as error:
             raise LinkError(f"cannot open {address}: {_why(error)}") from error
 
     def read(self, timeout: float) -> list[Frame]:
@@ -99,6 +100,6 @@ def _why(error: BaseException) -> str:
     text = " ".join(str(error).split()) or type(error).__name__
     if getattr(error, "errno", None) == 19 or "No such device" in text:
         return f"there is no such channel ({text})"
-    if isinstance(error, ImportError | NotImplementedError | AttributeError):
+    if isinstance(error, _NO_DRIVER):
         return f"its driver is not installed on this machine ({text})"
     return text
