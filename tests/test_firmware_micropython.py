@@ -13,10 +13,12 @@ FIRMWARE = Path(sim_device.firmware.__file__).parent
 MODULES = sorted(FIRMWARE.glob("*.py"))
 ALLOWED = {"struct", "array"}
 
-#: A stage and a gyro in virtual time: sessions, homing, a move, the watchdog, a stream.
+#: A stage and a gyro in virtual time: sessions, homing, a move, the watchdog, a stream; then both on CAN.
 SMOKE = """
 import struct
 from fake_boards import DEG, FakeGyroBoard, FakeStageBoard
+from sim_device.firmware.can_axis import AxisNode
+from sim_device.firmware.can_gyro import GyroNode
 from sim_device.firmware.framing import FrameReader, frame
 from sim_device.firmware.gyro import GyroDevice
 from sim_device.firmware.stage import StageDevice
@@ -51,8 +53,24 @@ print(run(10000000, beats=False))
 gyro = GyroDevice(FakeGyroBoard(3))
 gyro.feed(hello + request(0x10, 1), 0)
 print([len(body) for body in FrameReader().feed(gyro.poll(400000))])
+heard = []
+axis = AxisNode(FakeStageBoard(3 * DEG, 0), 0, 32)
+now = 1
+axis.feed(0, bytes((1, 32)), now)
+axis.feed(0x620, struct.pack("<BHBBBBB", 0x2F, 0x6060, 0, 6, 0, 0, 0), now)
+for word in (6, 7, 15, 31):
+    axis.feed(0x220, struct.pack("<Hi", word, 0), now)
+while now < 20000000:
+    now += 50000
+    axis.feed(0x77F, b"\\x05", now)
+    heard = [struct.unpack("<H", data[:2])[0] for name, data in axis.poll(now) if name == 0x1A0] or heard
+print(hex(heard[-1]))
+node = GyroNode(FakeGyroBoard(3), 16)
+node.feed(0, bytes((1, 0)), 0)
+node.feed(0x610, struct.pack("<BHBBBBB", 0x2F, 0x2020, 0, 1, 0, 0, 0), 0)
+print(len(node.poll(400000)))
 """
-SAID = "(2, 0, 3) True\n(2, 0, 3) 40\n(5, 1, 2)\n[64, 9, 504, 504]\n"
+SAID = "(2, 0, 3) True\n(2, 0, 3) 40\n(5, 1, 2)\n[64, 9, 504, 504]\n0x5637\n308\n"
 
 
 def _imports(source: str) -> set[str]:
