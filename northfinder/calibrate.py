@@ -15,7 +15,8 @@ from northfinder.calibration import AzimuthTable, Calibration, DriftTable, Model
 from northfinder.errors import ConfigError, EstimateError, RecordError
 from northfinder.estimation import Fix, Known
 from northfinder.estimation.calibration import Constants, ModelFit, Reading, calibrate
-from northfinder.estimation.propagation import Propagation, by_tilt
+from northfinder.estimation.geometry import by_tilt
+from northfinder.estimation.propagation import Propagation
 from northfinder.record import Record
 from northfinder.record_facts import RecordFacts, facts_of
 from northfinder.reduction import reduce_record

@@ -8,7 +8,9 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from datetime import UTC, datetime
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
@@ -21,7 +23,7 @@ from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import open_gyro, open_stage
 from drivers.transport.clock import SystemClock
 from northfinder.adaptive import Wishes, make_plan
-from northfinder.calibration import checked, read_calibration
+from northfinder.calibration import Calibration, checked, read_calibration
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.options import estimation_options
@@ -32,6 +34,9 @@ from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
 
 Device = TypeVar("Device", Gyro, Stage)
+
+#: When the command was given, as near as can be told.
+STARTED = time.monotonic()
 
 
 @click.command("find")
@@ -67,33 +72,7 @@ Device = TypeVar("Device", Gyro, Stage)
 @click.option("--speed", default="1", show_default=True, metavar="X|max", help="Emulator's speed over real time.")
 @click.option("--bus", type=click.Choice(["socketcand", "slcan"]), help="Emulate a CAN bus instead of serial lines.")
 @estimation_options
-def command(
-    *,
-    gyro_address: str | None,
-    stage_address: str | None,
-    config_file: Path | None,
-    plan: str | None,
-    time_s: float | None,
-    until_sd_deg: float | None,
-    azimuth_deg: float | None,
-    dwell_s: float | None,
-    repeat: int,
-    out: Path,
-    quiet: bool,
-    sim_azimuth: float,
-    sim_latitude: float,
-    sim_profile: str,
-    seed: int | None,
-    speed: str,
-    bus: str | None,
-    latitude_deg: float | None,
-    latitude_sd_deg: float,
-    calibration_file: Path | None,
-    profile: str | None,
-    g_drift_dph: float | None,
-    method: Method,
-    as_json: bool,
-) -> None:
+def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of Options
     """Measure the true azimuth of the input axis at stage azimuth zero, and the latitude.
 
     Without devices an emulated bench is started for the run.
@@ -103,69 +82,118 @@ def command(
       northfinder find --gyro native:/dev/ttyUSB0 --stage native:/dev/ttyUSB1 --latitude 50.429
       northfinder find --config bench.toml --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
-    started = time.monotonic()
+    options = Options(**given)
+    # Whatever can be wrong with the command is found before an emulator is started or a port is opened.
+    bench = options.bench()
+    config = bench or Config(gyro=GyroTable(address="", profile=options.sim_profile), stage=StageTable(address=""))
+    truth = None if bench else options.truth()
+    assumptions = options.assumptions(config)
+    plan = make_plan(options.wishes(config.measurement), assumptions, settle=config.measurement.settle_s)
     clock = SystemClock()
-    config = _bench(gyro_address, stage_address, config_file)
-    truth = None
-    if config is None:
-        truth = SimulationOptions(
-            azimuth_deg=sim_azimuth,
-            latitude_deg=sim_latitude,
-            profile=sim_profile,
-            seed=secrets.randbits(32) if seed is None else seed,
-            speed=speed,
-            bus=bus or "",
-        )
-        # The addresses follow once the emulator runs, which is only started for a command that is right otherwise.
-        config = Config(gyro=GyroTable(address="", profile=sim_profile), stage=StageTable(address=""))
-    wanted = config.measurement
-    today = datetime.now(UTC).date()
-    calibration = None if calibration_file is None else read_calibration(calibration_file)
-    if calibration is not None:
-        calibration.check(None, today)
-    assumptions = Assumptions.gather(
-        profile=profile or config.gyro.profile,
-        latitude_deg=wanted.latitude_deg if latitude_deg is None else latitude_deg,
-        latitude_sd_deg=latitude_sd_deg,
-        g_drift_dph=g_drift_dph,
-        method=method,
-        calibration=calibration,
-    )
-    wishes = _wishes(
-        wanted, plan=plan, time_s=time_s, until_sd_deg=until_sd_deg, azimuth_deg=azimuth_deg, dwell_s=dwell_s
-    )
-    course = make_plan(wishes, assumptions, settle=wanted.settle_s)
     with ExitStack() as stack:
         if truth is not None:
             config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
         stop_requested = stack.enter_context(_stop_on_signal(clock))
-        display = stack.enter_context(DisplayContext(clock, quiet=quiet))
+        display = stack.enter_context(DisplayContext(clock, quiet=options.quiet))
         results: list[dict[str, Any]] = []
-        for _ in range(repeat):
-            begun = time.monotonic() if results else started
+        for _ in range(options.repeat):
+            begun = time.monotonic() if results else STARTED
             measurement = Measurement(
-                open_gyro=lambda: checked(
-                    _opened(open_gyro, config.gyro.address, clock, baudrate=config.gyro.baudrate), calibration, today
-                ),
-                open_stage=lambda: _opened(
-                    open_stage,
-                    config.stage.address,
-                    clock,
-                    baudrate=config.stage.baudrate,
-                    limits=config.stage.limits(),
-                    **config.stage.options(),
-                ),
-                plan=course,
-                settle=wanted.settle_s,
+                open_gyro=partial(_open_gyro, config.gyro, clock, assumptions.calibration),
+                open_stage=partial(_open_stage, config.stage, clock),
+                plan=plan,
+                settle=config.measurement.settle_s,
                 assumptions=assumptions,
-                record=_record_path(out),
+                record=_record_path(options.out),
                 meta={"northfinder": version("northfinder"), "config": config, "simulation": truth},
             )
             outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
-            results.append(outcome.to_json() | {"plan": course.name, "wall_s": round(time.monotonic() - begun, 3)})
-    _show(results, None if truth is None else (truth.azimuth_deg, truth.latitude_deg), as_json=as_json)
+            results.append(outcome.to_json() | {"plan": plan.name, "wall_s": round(time.monotonic() - begun, 3)})
+    _show(results, None if truth is None else (truth.azimuth_deg, truth.latitude_deg), as_json=options.as_json)
     for result in results:
         require_trustworthy(result)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What the command line says, in the units of its options."""
+
+    gyro_address: str | None
+    stage_address: str | None
+    config_file: Path | None
+    plan: str | None
+    time_s: float | None
+    until_sd_deg: float | None
+    azimuth_deg: float | None
+    dwell_s: float | None
+    repeat: int
+    out: Path
+    quiet: bool
+    sim_azimuth: float
+    sim_latitude: float
+    sim_profile: str
+    seed: int | None
+    speed: str
+    bus: str | None
+    latitude_deg: float | None
+    latitude_sd_deg: float
+    calibration_file: Path | None
+    profile: str | None
+    g_drift_dph: float | None
+    method: Method
+    as_json: bool
+
+    def bench(self) -> Config | None:
+        """Return the bench that was named, None if none was. Raises ConfigError."""
+        if self.config_file is not None:
+            if self.gyro_address or self.stage_address:
+                raise ConfigError("--config names the devices: leave --gyro and --stage out")
+            return read_config(self.config_file)
+        if self.gyro_address is None and self.stage_address is None:
+            return None
+        if self.gyro_address is None or self.stage_address is None:
+            raise ConfigError("--gyro and --stage go together: one of them is missing")
+        return Config(gyro=GyroTable(address=self.gyro_address), stage=StageTable(address=self.stage_address))
+
+    def truth(self) -> SimulationOptions:
+        """Return the world to emulate; without a seed another one each time."""
+        return SimulationOptions(
+            azimuth_deg=self.sim_azimuth,
+            latitude_deg=self.sim_latitude,
+            profile=self.sim_profile,
+            seed=secrets.randbits(32) if self.seed is None else self.seed,
+            speed=self.speed,
+            bus=self.bus or "",
+        )
+
+    def assumptions(self, config: Config) -> Assumptions:
+        """Return what is taken as known, from the options or else from the configuration. Raises ConfigError."""
+        calibration = None if self.calibration_file is None else read_calibration(self.calibration_file)
+        if calibration is not None:
+            calibration.check(None, _today())
+        return Assumptions.gather(
+            profile=self.profile or config.gyro.profile,
+            latitude_deg=config.measurement.latitude_deg if self.latitude_deg is None else self.latitude_deg,
+            latitude_sd_deg=self.latitude_sd_deg,
+            g_drift_dph=self.g_drift_dph,
+            method=self.method,
+            calibration=calibration,
+        )
+
+    def wishes(self, table: MeasurementTable) -> Wishes:
+        """Return what is asked of the plan, by the options or else by the configuration."""
+        time_s, dwell_s = self.time_s, self.dwell_s
+        if time_s is None and dwell_s is None:
+            time_s, dwell_s = table.time_s, table.dwell_s
+        until_sd_deg = table.until_sd_deg if self.until_sd_deg is None else self.until_sd_deg
+        azimuth_deg = table.azimuth_deg if self.azimuth_deg is None else self.azimuth_deg
+        return Wishes(
+            name=self.plan or table.plan,
+            time=time_s,
+            dwell=dwell_s,
+            until_sd=None if until_sd_deg is None else math.radians(until_sd_deg),
+            azimuth=None if azimuth_deg is None else math.radians(azimuth_deg),
+        )
 
 
 def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, as_json: bool) -> None:
@@ -187,40 +215,17 @@ def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, a
         print_campaign(summary)
 
 
-def _wishes(
-    table: MeasurementTable,
-    *,
-    plan: str | None,
-    time_s: float | None,
-    until_sd_deg: float | None,
-    azimuth_deg: float | None,
-    dwell_s: float | None,
-) -> Wishes:
-    """Return what the command line asks of the plan, and where it says nothing the configuration."""
-    if time_s is None and dwell_s is None:
-        time_s, dwell_s = table.time_s, table.dwell_s
-    until_sd_deg = table.until_sd_deg if until_sd_deg is None else until_sd_deg
-    azimuth_deg = table.azimuth_deg if azimuth_deg is None else azimuth_deg
-    return Wishes(
-        name=plan or table.plan,
-        time=time_s,
-        dwell=dwell_s,
-        until_sd=None if until_sd_deg is None else math.radians(until_sd_deg),
-        azimuth=None if azimuth_deg is None else math.radians(azimuth_deg),
-    )
+def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None) -> Gyro:
+    """Open the gyro; connecting it then checks that the calibration is its own and still valid."""
+    return checked(_opened(open_gyro, table.address, clock, baudrate=table.baudrate), calibration, _today())
 
 
-def _bench(gyro_address: str | None, stage_address: str | None, config_file: Path | None) -> Config | None:
-    """Return the bench the operator named, None if none was named."""
-    if config_file is not None:
-        if gyro_address or stage_address:
-            raise ConfigError("--config names the devices: leave --gyro and --stage out")
-        return read_config(config_file)
-    if gyro_address is None and stage_address is None:
-        return None
-    if gyro_address is None or stage_address is None:
-        raise ConfigError("--gyro and --stage go together: one of them is missing")
-    return Config(gyro=GyroTable(address=gyro_address), stage=StageTable(address=stage_address))
+def _open_stage(table: StageTable, clock: Clock) -> Stage:
+    return _opened(open_stage, table.address, clock, baudrate=table.baudrate, limits=table.limits(), **table.options())
+
+
+def _today() -> date:
+    return datetime.now(UTC).date()
 
 
 def _opened(opener: Callable[..., Device], address: str, clock: Clock, **options: object) -> Device:
