@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import random
 import re
+import select
 import socket
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import count
 
 import can
@@ -345,15 +346,16 @@ class FakeAdapter:
         self._answers = {"C": b"\a", "S": b"\r", "O": b"\r", "F": b"F00\r", "t": b"z\r"} | answers
         self.heard: list[bytes] = []
         self.news = threading.Condition()
-        threading.Thread(target=self._serve, daemon=True).start()
+        self._unplugged = False
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
 
     def _serve(self) -> None:
         rest = b""
-        while True:
-            try:
-                rest += os.read(self._master, 1000)
-            except OSError:
-                return
+        while not self._unplugged:
+            if not select.select([self._master], [], [], 0.02)[0]:
+                continue
+            rest += os.read(self._master, 1000)
             *lines, rest = rest.split(b"\r")
             with self.news:
                 self.heard += [line for line in lines if line]
@@ -363,14 +365,16 @@ class FakeAdapter:
                     self.say(self._answers.get(chr(line[0]), b""))
 
     def say(self, text: bytes) -> None:
-        """Say something; nothing once it is unplugged."""
-        with suppress(OSError):
-            os.write(self._master, text)
+        """Say something."""
+        os.write(self._master, text)
 
     def unplug(self) -> None:
         """Pull the cable."""
-        os.close(self._slave)
-        os.close(self._master)
+        if not self._unplugged:
+            self._unplugged = True
+            self._thread.join(PATIENCE)
+            os.close(self._slave)
+            os.close(self._master)
 
 
 @contextmanager
