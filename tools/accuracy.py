@@ -54,7 +54,7 @@ LATITUDES = tuple(math.radians(latitude) for latitude in (-75, -50.429, -20, 0.5
 TURN_PUBLISHED, TURN = 10.0, 8.0  #: s
 SAMPLE_RATE = 1.0  #: Hz; the plant's samples are exact means of its continuous noise at any rate
 TIMES = (180.0, 300.0, 960.0)  #: s
-RENEWALS = 10  #: dwells after which the running estimate points the stage as well as any later one
+RENEWALS = range(3, 9)  #: after how many dwells the running estimate is renewed: later ones would point no better
 KEYS = ("rms_deg", "rms_over_sd", "coverage")  #: of the table printed
 #: Promised: method, figure, lowest, highest.
 PROMISES = (
@@ -135,7 +135,7 @@ class Bench:
         fix = None
         while (step := plan.next_step(self.standing(fix))) is not None:
             self.dwell(step)
-            if assumptions is not None and len(self.spans) <= RENEWALS:
+            if assumptions is not None and len(self.spans) in RENEWALS:
                 fix = running(fix, self.means(), assumptions)
         return self.means()
 
