@@ -1,0 +1,198 @@
+"""The whole way over emulated buses: command line, drivers, real sockets and pseudo-terminals, emulator process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from drivers.api import StageMode
+from drivers.discovery import open_gyro, open_stage
+from drivers.errors import DeviceError, DeviceTimeoutError, LinkError
+from drivers.transport.clock import SystemClock
+from sim_device.can_bench import CanBench
+from sim_device.virtual_bus import BusPump
+
+BUSES = ["socketcand", pytest.param("slcan", marks=pytest.mark.skipif(sys.platform == "win32", reason="needs a pty"))]
+PATIENCE = 20.0
+
+
+@contextmanager
+def emulator(*arguments: str) -> Iterator[dict[str, str]]:
+    """Yield what an emulator process announces; end it afterwards."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "sim_device", "--parent-death", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert child.stdout is not None
+        announcement: dict[str, str] = json.loads(child.stdout.readline())
+        yield announcement
+    finally:
+        child.terminate()
+        child.communicate()
+
+
+def northfinder(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line."""
+    return subprocess.run(
+        [sys.executable, "-m", "northfinder", *arguments], capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_find_over_an_emulated_bus(bus: str, tmp_path: Path) -> None:
+    """`find --bus` measures on the emulated bus: no sample lost, and the truth within four standard deviations."""
+    done = northfinder(
+        "find", "--bus", bus, "--json", "--quiet", "--speed", "max", "--plan", "six-position", "--dwell", "10",
+        "--seed", "3", "--sim-azimuth", "217", "--out", str(tmp_path),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout)
+    error = (result["azimuth_deg"] - 217 + 180) % 360 - 180
+    assert abs(error) < 4 * result["azimuth_sd_deg"]
+    assert result["n_lost"] == 0
+    assert result["n_samples"] > 235 * 80
+
+
+def test_a_bus_goes_in_the_middle_of_a_run(tmp_path: Path) -> None:
+    """An adapter pulled out ends the measurement with one sentence and the exit code of devices."""
+    with emulator("--bus", "socketcand", "--speed", "max", "--fault", "bus:unplug@40") as addresses:
+        done = northfinder(
+            "find", "--gyro", addresses["gyro"], "--stage", addresses["stage"], "--profile", "tvg43", "--quiet",
+            "--plan", "six-position", "--dwell", "10", "--out", str(tmp_path),
+        )  # fmt: skip
+    assert done.returncode == 3
+    assert "was unplugged" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_bus_off_over_socketcand() -> None:
+    """Error frames of a controller that has gone off the bus end both drivers' use of it."""
+    with emulator("--bus", "socketcand", "--fault", "bus:off@2") as addresses:
+        clock = SystemClock()
+        gyro, stage = open_gyro(addresses["gyro"], clock), open_stage(addresses["stage"], clock)
+
+        def use() -> None:
+            gyro.connect()
+            stage.connect()
+            gyro.start()
+            deadline = clock.now() + PATIENCE
+            while clock.now() < deadline:
+                gyro.read()
+                stage.state()
+                clock.wait(clock.now() + 0.05)
+
+        try:
+            with pytest.raises(LinkError, match="off the bus"):
+                use()
+        finally:
+            stage.close()
+            gyro.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pty")
+def test_another_bit_rate_is_pointed_out() -> None:
+    """An adapter set to another bit rate hears errors only: the gyro's timeout asks for the bit rate."""
+    with emulator("--bus", "slcan") as addresses:
+        clock = SystemClock()
+        gyro = open_gyro(addresses["gyro"].replace("@1000000", "@500000"), clock)
+        with pytest.raises(DeviceTimeoutError, match="bit rate"):
+            gyro.connect()
+        gyro.close()
+
+
+def test_the_drivers_on_the_bus_of_a_program() -> None:
+    """Over python-can's virtual interface, with the bench in a thread: connect, home, stream, no sample lost."""
+    clock = SystemClock()
+    stop = threading.Event()
+    with can.Bus("end-to-end", interface="virtual") as bus:
+        pump = threading.Thread(target=BusPump(CanBench("tvg43", seed=1), bus).run, args=(stop, 10.0), daemon=True)
+        pump.start()
+        gyro = open_gyro("canopen-gyro:virtual:end-to-end/16", clock)
+        stage = open_stage("cia402-stage:virtual:end-to-end/32,33", clock)
+        try:
+            gyro.connect()
+            stage.connect()
+            stage.home()
+            gyro.start()
+            deadline = clock.now() + PATIENCE
+            blocks = []
+            while stage.state().mode is not StageMode.IDLE and clock.now() < deadline:
+                blocks += gyro.read()
+                clock.wait(clock.now() + 0.05)
+            assert stage.state().mode is StageMode.IDLE
+            assert sum(len(block.counts) for block in blocks) > 235
+            assert not any(block.n_lost for block in blocks)
+        finally:
+            stage.close()
+            gyro.close()
+            stop.set()
+            pump.join(PATIENCE)
+
+
+def test_canlog_names_what_passes(tmp_path: Path) -> None:
+    """The log of a bus reads in names, and reads the same from its recording; a stranger's frames stay numbers."""
+    tool = Path(__file__).parent.parent / "tools" / "canlog.py"
+    recording = tmp_path / "bench.asc"
+    with emulator("--bus", "socketcand", "--speed", "5") as addresses:
+        where = addresses["gyro"].removeprefix("canopen-gyro:").rpartition("/")[0]
+        shown = tmp_path / "shown.txt"
+        with (
+            shown.open("w") as out,
+            subprocess.Popen(
+                [sys.executable, str(tool), where, "--out", str(recording), "--seconds", "2"], stdout=out
+            ) as log,
+        ):
+            clock = SystemClock()
+            gyro = open_gyro(addresses["gyro"], clock)
+            deadline = clock.now() + PATIENCE
+            while not recording.exists() and clock.now() < deadline:
+                clock.wait(clock.now() + 0.05)
+            gyro.connect()
+            gyro.start()
+            while log.poll() is None and clock.now() < deadline:
+                gyro.read()
+                clock.wait(clock.now() + 0.05)
+            gyro.close()
+    text = shown.read_text()
+    for part in (
+        "gyro 16 heartbeat, pre-operational", "NMT start, node 16", "gyro 16 SDO read Number of axes (2012:0): 1",
+        "gyro 16 SDO written Stream (2020:0)", "TPDO 1: Rate, axis 1 ", "TPDO 3: Temperature ", "RPDO 1: Samples seen ",
+        "axis 32 heartbeat",
+    ):  # fmt: skip
+        assert part in text, part
+    again = subprocess.run([sys.executable, str(tool), str(recording)], capture_output=True, text=True, check=True)
+    named = [[line[16:] for line in log_text.splitlines()] for log_text in (text, again.stdout)]
+    assert named[0] == named[1]
+
+
+def test_a_vcan_carries_the_bench_too() -> None:
+    """Where the kernel has vcan0, the drivers find the bench on it as on any bus."""
+    try:
+        bus = can.Bus("vcan0", interface="socketcan")
+    except (OSError, can.CanError):
+        pytest.skip("no vcan0 on this machine")
+    clock, stop = SystemClock(), threading.Event()
+    with bus:
+        pump = threading.Thread(target=BusPump(CanBench("tvg43", seed=1), bus).run, args=(stop,), daemon=True)
+        pump.start()
+        gyro = open_gyro("canopen-gyro:socketcan:vcan0/16", clock)
+        try:
+            assert gyro.connect().model == "tvg43"
+        except DeviceError as error:
+            pytest.fail(str(error))
+        finally:
+            gyro.close()
+            stop.set()
+            pump.join(PATIENCE)
