@@ -12,10 +12,13 @@ from virtual import virtual_bench
 
 from drivers.api import Gyro, Stage, StageLimits, StageMode, StageState
 from drivers.cia402 import Cia402Stage, DriveOptions
-from drivers.errors import DeviceFaultError
+from drivers.errors import DeviceFaultError, ProtocolError
+from northfinder.config import read_config
 from northfinder.cyclogram import six_position
+from northfinder.errors import ConfigError
 from northfinder.record import Record
 from sim_device.can_bench import AZIMUTH_ID, ELEVATION_ID
+from sim_device.firmware.can_axis import AxisNode
 
 ARCSEC = radians(1 / 3600)
 SHORT = six_position(10.0)
@@ -264,3 +267,74 @@ def test_the_drives_stop_when_the_host_dies() -> None:
 def _encoders(bench: CanVirtualBench) -> list[int]:
     """Return the counts of both axes' encoders."""
     return [bench.bench.stage_board.encoder(axis, bench.bench.now_us) for axis in (0, 1)]
+
+
+def of_the_market(identifier: int, data: bytes) -> list[tuple[int, bytes]]:
+    """Let the axes be another maker's: another vendor and product."""
+    if identifier in {0x580 + AZIMUTH_ID, 0x580 + ELEVATION_ID} and data[1:4] in {b"\x18\x10\x01", b"\x18\x10\x02"}:
+        return [(identifier, data[:4] + b"\xef\xbe\xad\xde")]
+    return [(identifier, data)]
+
+
+def test_drives_of_the_market_work_by_standard_objects_alone() -> None:
+    """Of a drive that is not ours only standard objects are touched; its units, also reversed, are options."""
+    bench = can_bench(drive=DriveOptions(units_per_turn=(12_960_000.0, -12_960_000.0)))
+    bench.tap.to_host = of_the_market
+    stage = bench.homed()
+    stage.move(radians(30), radians(10))
+    state = bench.serve(stage, lambda state: state.in_position)
+    assert (state.azimuth, state.elevation) == pytest.approx((radians(30), radians(10)), abs=30 * ARCSEC)
+    positions = [axis.drive.position(bench.bench.now_us) for axis in _axes(bench)]
+    assert positions == pytest.approx([1_080_000, -360_000], abs=300)
+    assert state.device_time == pytest.approx(bench.clock.now(), abs=0.2)
+    stage.stop()
+    stage.close()
+    requests = [data for _, identifier, data in bench.tap.asked if identifier in {0x620, 0x621}]
+    assert not [data for data in requests if 0x20 <= data[2] < 0x60 and data[0] >> 5 in {1, 2}]
+
+
+def _axes(bench: CanVirtualBench) -> list[AxisNode]:
+    """Return the firmware of both axes."""
+    nodes = [bench.bench.azimuth.node, bench.bench.elevation.node]
+    return [node for node in nodes if isinstance(node, AxisNode)]
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "complaint"),
+    [
+        (b"\x00\x10\x00", 0x191, "is no drive of CiA 402: its device type is 00000191"),
+        (b"\x10\x20\x00", 1, "is the other axis"),
+    ],
+)
+def test_another_device_is_refused(index: bytes, value: int, complaint: str) -> None:
+    """A node that is no drive, or the other axis, is named as such before anything is written to it."""
+    bench = can_bench()
+    bench.tap.to_host = lambda identifier, data: [
+        (identifier, data[:4] + value.to_bytes(4, "little") if data[1:4] == index and identifier == 0x5A0 else data)
+    ]
+    with pytest.raises(ProtocolError, match=complaint):
+        bench.open_stage().connect()
+    assert not [data for _, identifier, data in bench.tap.asked if identifier == 0x620 and data[0] >> 5 == 1]
+
+
+def test_the_configuration_tells_the_drives(tmp_path: Path) -> None:
+    """The bench file's [stage.drive] becomes the driver's options, in SI; it is for such stages only, and checked."""
+    bench = tmp_path / "bench.toml"
+    text = """[gyro]
+address = "canopen-gyro:virtual:b/16"
+[stage]
+address = "{}"
+[stage.drive]
+azimuth_units_per_turn = -3600.0
+homing_method = 33
+home_speed_deg_s = {}
+"""
+    bench.write_text(text.format("cia402-stage:virtual:b/32,33", 9))
+    options = read_config(bench).stage.options()["drive"]
+    assert options == DriveOptions(units_per_turn=(-3600.0, None), homing_method=33, home_speed=radians(9))
+    bench.write_text(text.format("native:/dev/ttyUSB0", 9))
+    with pytest.raises(ConfigError, match="is for a cia402-stage, not for native:/dev/ttyUSB0"):
+        read_config(bench).stage.options()
+    bench.write_text(text.format("cia402-stage:virtual:b/32,33", -1))
+    with pytest.raises(ConfigError, match="home_speed must be positive"):
+        read_config(bench).stage.options()

@@ -10,7 +10,7 @@ class DriveOptions:
     """Units, homing and motion of both drives; None leaves to a drive what it has.
 
     Pairs are azimuth and elevation. `units_per_turn` counts position units of the drive a turn of the stage, negative
-    if the drive counts the other way; left out it is the drive's encoder resolution (608F) times its gear (6091).
+    if the drive counts the other way; left out it is the drive's encoder resolution (608F), without any gear.
     """
 
     units_per_turn: tuple[float | None, float | None] = (None, None)
