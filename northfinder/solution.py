@@ -16,6 +16,7 @@ from northfinder.estimation.disturbance import undisturbed
 from northfinder.estimation.geometry import wrapped
 from northfinder.estimation.least_squares import Weights
 from northfinder.profile import GyroProfile, NoiseTable, find_profile
+from northfinder.published import published_json
 from northfinder.units import ARCSEC, DPH
 
 Method = Literal["generalised", "ordinary"]
@@ -193,13 +194,14 @@ def _planes_estimated(problem: Problem, known: Known, declared: Declared) -> Fix
 
 
 def supplement(means: RateMeans, assumptions: Assumptions, fix: Fix) -> dict[str, Any]:
-    """Return what a report says beside the fix that `solve` gave: its uncertainty budget, the calibration applied."""
+    """Return what a report says beside the fix that `solve` gave: its budget, published formulas, the calibration."""
     problem = Problem.of(means, assumptions)
     budget = error_budget(
         problem.means, fix, noise=problem.noise, known=assumptions.known(), drift=problem.drift,
         weights=problem.weights, declared=assumptions.declared(),
     )  # fmt: skip
-    return {"budget": budget_to_json(budget)} | calibration_to_json(assumptions)
+    published = published_json(means, problem.noise, fix)
+    return {"budget": budget_to_json(budget)} | published | calibration_to_json(assumptions)
 
 
 def calibration_to_json(assumptions: Assumptions) -> dict[str, Any]:

@@ -126,6 +126,17 @@ def test_the_unknown_g_drift_goes_into_the_latitude_as_predicted(tmp_path: Path)
     assert wrong["azimuth_deg"] == pytest.approx(right["azimuth_deg"], abs=1e-3)
 
 
+def test_the_published_formulas_stand_beside_the_fix(tmp_path: Path) -> None:
+    """(2), (3) and (10) on the published positions: near the fix, but for the drift that (3) does not know of."""
+    outcome = virtual_bench(seed=12).measure(tmp_path / "r.sqlite", six_position(30.0)).to_json()
+    published = outcome["closed_form"]
+    assert published["azimuth_deg"] == pytest.approx(outcome["azimuth_deg"], abs=4 * published["azimuth_sd_deg"])
+    assert published["latitude_deg"] == pytest.approx(56.6, abs=4 * published["latitude_sd_deg"])
+    assert published["bias_horizontal_dph"] == pytest.approx(outcome["bias_dph"], abs=0.5)
+    assert published["scale_factor_horizontal"] == pytest.approx(1.021, abs=0.03)
+    assert published["scale_factor_vertical"] == pytest.approx(1.28, abs=0.03)
+
+
 def test_a_bad_constant_is_refused() -> None:
     """A drift rate that is no number is the operator's mistake."""
     with pytest.raises(ConfigError, match="finite number, not nan"):

@@ -52,7 +52,7 @@ def estimation_options(command: Command) -> Command:
             type=click.Choice(METHODS),
             default="generalised",
             show_default=True,
-            help="Generalised or ordinary least squares, or the closed forms of the published method.",
+            help="Weights of the least squares.",
         ),
         click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output."),
     ]
