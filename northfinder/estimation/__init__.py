@@ -2,7 +2,7 @@
 
 One linear model serves all: the mean rate over an interval is ``h . (N, E, V) + bias(t) + noise``, with the input axis
 ``h`` from the measured stage angles and tilt. ``N, E, V`` are the earth's rotation, times the scale factor, along stage
-azimuth zero turned to true north (docs/method.md, section 5); azimuth and latitude follow from them.
+azimuth zero turned to true north (docs/method.md, section 3); azimuth and latitude follow from them.
 """
 
 from northfinder.estimation.checks import Check

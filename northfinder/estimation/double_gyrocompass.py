@@ -1,7 +1,7 @@
 """Double gyrocompassing: what one triad at rest in several positions tells, its gyro biases among it.
 
 The positions of one body share the biases ``b`` of its gyros. With ``u_p`` up in the body frame, from the
-accelerometers, least squares over all positions ``p`` (docs/method.md, section 3),
+accelerometers, least squares over all positions ``p`` (docs/method.md, section 5),
 
     w_p = b + Omega (cos lat north_p(heading_p) + sin lat u_p),
 

@@ -2,7 +2,7 @@
 
 The mean rate of a dwell is ``h . (N, E, V) + bias + noise`` with ``h`` as in `northfinder.estimation.geometry` and a
 bias that wanders from dwell to dwell by any amount. Where the dwells come in pairs of opposite attitudes, the half
-differences of the pairs hold no bias and do not share any noise: plain least squares (docs/method.md, section 3, double
+differences of the pairs hold no bias and do not share any noise: plain least squares (docs/method.md, section 5, double
 gyrocompassing at turn angles 0 and 180). In any other order the differences of all successive dwells are used, as
 least squares with white noise plus a random walk of the bias, whose ratio is found by restricted maximum likelihood.
 """

@@ -1,4 +1,4 @@
-"""From interval means to a fix: ordinary or generalised least squares of the one linear model (docs/method.md, 5).
+"""From interval means to a fix: ordinary or generalised least squares of the linear model (docs/method.md, 3).
 
 Ordinary weights with the mean of each dwell are what the published method amounts to; generalised weights with short
 means are the best linear unbiased estimate for the noise model given.
@@ -245,7 +245,22 @@ def _checks(
     found += [checks.residuals(name, chi2, dof) for name, chi2, dof in fit.tests if dof]
     if vertical and known != _UNKNOWN:
         found += _agreements(nev, covariance, known, fit.sd_dof)
+    if not vertical and known.latitude is not None and known.scale_factor is not None:
+        found.append(_horizontal_agreement(nev, covariance, known.latitude, known.scale_factor, known, fit.sd_dof))
     return found
+
+
+def _horizontal_agreement(
+    nev: Array, covariance: Array, latitude: float, scale_factor: float, known: Known, sd_dof: float
+) -> checks.Check:
+    """Return whether the horizontal earth rate is that of the known latitude, as the gyro's scale factor shows it."""
+    horizontal = math.hypot(nev[0], nev[1])
+    direction = nev[:2] / horizontal
+    expected = EARTH_RATE * math.cos(latitude)
+    by_latitude = scale_factor * EARTH_RATE * math.sin(latitude) * known.latitude_sd
+    measured_sd = math.sqrt(max(float(direction @ covariance[:2, :2] @ direction), 0.0))
+    sd = math.hypot(measured_sd, expected * known.scale_factor_sd, by_latitude)
+    return checks.agreement("earth rate", horizontal - scale_factor * expected, sd, "rad/s", sd_dof)
 
 
 def _agreements(nev: Array, covariance: Array, known: Known, sd_dof: float) -> list[checks.Check]:

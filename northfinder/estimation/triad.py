@@ -1,6 +1,6 @@
 """A triad of gyros and accelerometers at rest: analytic gyrocompassing, and double gyrocompassing over positions.
 
-With ``u = a / |a|`` up in the body frame and ``w`` the rate, one position gives (docs/method.md, section 3, [S1] (4))
+With ``u = a / |a|`` up in the body frame and ``w`` the rate, one position gives (docs/method.md, section 5, [S1] (4))
 
     lat = atan2(u.w, |w - (u.w) u|),  north = unit(w - (u.w) u),  east = north x u,
     azimuth of a body axis = atan2(axis.east, axis.north), its elevation = asin(axis.u)
