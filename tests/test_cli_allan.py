@@ -142,3 +142,13 @@ def test_a_real_recording_agrees_with_allantools(capsys: pytest.CaptureFixture[s
     np.testing.assert_allclose(np.array(curve["model_dph"])[within], peer[within], rtol=0.1)
     assert result["coefficients"]["angle_random_walk_deg_per_sqrt_h"]["value"] == pytest.approx(2.41, abs=0.05)
     assert result["coefficients"]["bias_instability_dph"]["value"] == pytest.approx(27.5, abs=5.0)
+
+
+def test_a_record_too_short_for_a_profile_saves_none(
+    capsys: pytest.CaptureFixture[str], recording: Path, tmp_path: Path
+) -> None:
+    """Five minutes say nothing of the drift within a measurement: exit code 4, and no file."""
+    path = tmp_path / "short.toml"
+    assert allan(recording, "--skip", "3300", "--save", path) == 4
+    assert "a profile needs at least 600 s at rest, and this record holds 300 s" in capsys.readouterr().err
+    assert not path.exists()

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from northfinder.cli.show import print_json
+from northfinder.errors import EstimateError
 from northfinder.estimation.allan import AllanCurve, allan_curve
 from northfinder.estimation.noise_identification import Identification, identify
 from northfinder.noise_report import FIELDS, decades, in_field_units, noise_json, save_profile
@@ -18,6 +19,12 @@ from northfinder.text import printable
 from northfinder.units import DPH
 
 _POSITIVE = click.FloatRange(min=0.0, min_open=True)
+
+
+#: A profile serves measurements of some minutes; what is identified from less says nothing of their drift, in s.
+SHORTEST_FOR_PROFILE = 600.0
+#: Relative departure of the spectrum from the model beyond which it is no model of it.
+GREATEST_MODEL_ERROR = 0.5
 
 
 @click.command("allan")
@@ -61,6 +68,7 @@ def command(
     curve = allan_curve(series.rate, series.sample_rate, identified.noise)
     result = {"file": str(file)} | noise_json(series, identified, curve)
     if save is not None:
+        _require_worth_saving(series, identified)
         save_profile(save, save.stem if name is None else name, series, identified)
         result["profile"] = str(save)
     if plot is not None:
@@ -71,6 +79,20 @@ def command(
         print_json(result)
     else:
         _print(series, identified, curve, result)
+
+
+def _require_worth_saving(series: RateSeries, identified: Identification) -> None:
+    """Raise EstimateError if a profile of this record would mislead every later fix."""
+    if series.duration < SHORTEST_FOR_PROFILE:
+        raise EstimateError(
+            f"a profile needs at least {SHORTEST_FOR_PROFILE:g} s at rest, and this record holds "
+            f"{series.duration:.0f} s: nothing was saved"
+        )
+    if identified.model_error > GREATEST_MODEL_ERROR:
+        raise EstimateError(
+            f"the spectrum departs from the five kinds of noise by {100 * identified.model_error:.0f} %: something "
+            "else than the gyro's noise is in the record, and nothing was saved"
+        )
 
 
 def _print(series: RateSeries, identified: Identification, curve: AllanCurve, result: dict[str, Any]) -> None:
