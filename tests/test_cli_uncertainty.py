@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from virtual import virtual_bench
 
 from northfinder.calibration import read_calibration
-from northfinder.cli import cli
-from northfinder.cyclogram import six_position
-from northfinder.errors import ConfigError, NorthFinderError, RecordError
+from northfinder.cli import cli, exit_code
+from northfinder.cyclogram import four_position, six_position
+from northfinder.errors import ConfigError, EstimateError, NorthFinderError, RecordError
 
 
 def northfinder(*arguments: object) -> str:
@@ -150,3 +150,20 @@ def test_a_calibration_needs_one_gyro_and_known_places(records: list[Path], tmp_
         northfinder("calibrate", records[0])
     with pytest.raises(ConfigError, match="given 2 times for 3 records"):
         northfinder("calibrate", *records[:3], "--latitude", 1, "--latitude", 2)
+
+
+def test_a_wrong_latitude_without_a_vertical_plane_is_caught(tmp_path: Path) -> None:
+    """Four positions and a gyro whose scale factor is known: 10 deg off is no trustworthy estimate, exit code 4."""
+    record, profile = tmp_path / "four.sqlite", tmp_path / "mine.toml"
+    virtual_bench(seed=22).measure(record, four_position(20.0), latitude_deg=50.429)
+    profile.write_text(
+        'name = "mine"\nscale_factor = 1.021\nscale_factor_sd = 0.002\n'
+        "[noise]\nangle_white_noise_dph_s = 0.764\nbias_instability_dph = 0.06\n"
+        "angle_random_walk_deg_per_sqrt_h = 0.003\nrate_random_walk_dph_per_sqrt_h = 0.2\n"
+    )
+    right = as_json("solve", record, "--profile", profile)
+    assert {check["name"]: check["unit"] for check in right["checks"]}["earth rate"] == "deg/h"
+    assert right["trustworthy"]
+    with pytest.raises(EstimateError, match="no trustworthy estimate: the measured earth rate does not agree") as wrong:
+        northfinder("solve", record, "--profile", profile, "--latitude", 60.429)
+    assert exit_code(wrong.value) == 4

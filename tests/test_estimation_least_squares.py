@@ -353,6 +353,38 @@ def test_a_wrong_entry_is_contradicted_by_the_data() -> None:
         assert names == (["latitude"] if wrong.latitude != right.latitude else ["scale factor"])
 
 
+def test_without_a_vertical_plane_the_horizontal_rate_judges_the_latitude_entered() -> None:
+    """The right entry passes; 10 deg off, or a scale factor 5 % off, is caught unless it was said to be as unsure."""
+    rng = np.random.default_rng(12)
+    means = make_means(75.0, 50.0, positions=FOUR, scale_factor=1.02)
+    means = replaced(means, rate=means.rate + draw_noise(rng, means, 1, **TVG43).T)
+    right = Known(latitude=math.radians(50.0), scale_factor=1.02)
+    fix = estimate(means, noise=NOISE, known=right)
+    assert fix.trustworthy
+    assert "earth rate" in [check.name for check in fix.checks]
+    for wrong in (replace(right, latitude=math.radians(60.0)), replace(right, scale_factor=1.07)):
+        assert not estimate(means, noise=NOISE, known=wrong).trustworthy
+        assert failed(estimate(means, noise=NOISE, known=wrong)) == ["earth rate"]
+        unsure = replace(wrong, latitude_sd=math.radians(5.0), scale_factor_sd=0.03)
+        assert estimate(means, noise=NOISE, known=unsure).trustworthy
+    for lacking in (replace(right, latitude=None), replace(right, scale_factor=None)):
+        assert "earth rate" not in [check.name for check in estimate(means, noise=NOISE, known=lacking).checks]
+    sentence = next(c.sentence for c in estimate(means, noise=NOISE, known=wrong).checks if c.name == "earth rate")
+    assert "differs by -0.4" in sentence
+    assert "deg/h" in sentence
+
+
+def test_the_limit_of_the_earth_rate_holds_what_the_noise_and_the_entries_bring() -> None:
+    """Standard deviation by first principles: entries alone, with no noise to speak of."""
+    means = make_means(0.0, 50.0, positions=FOUR)
+    known = Known(latitude=math.radians(50.0), latitude_sd=0.001, scale_factor=1.0, scale_factor_sd=0.002)
+    fix = estimate(means, noise=NoiseModel(angle_white_noise=1e-12), known=known)
+    (check,) = (each for each in fix.checks if each.name == "earth rate")
+    expected = OMEGA_DPH * math.hypot(0.002 * math.cos(math.radians(50.0)), 0.001 * math.sin(math.radians(50.0)))
+    assert check.sd / DPH == pytest.approx(expected, rel=1e-3)
+    assert check.limit / check.sd == pytest.approx(3.29, abs=0.01)
+
+
 def test_the_acceleration_sensitive_drift_shifts_the_latitude_as_published() -> None:
     """Left out, 3 deg/h/g turn 50.429 deg into some 56 deg, the published error; taken out, the latitude is right."""
     means = make_means(18.887, 50.429, d_g_dph=3.0)

@@ -67,10 +67,10 @@ def residuals(name: str, chi2: float, dof: int) -> Check:
 
 
 def agreement(name: str, difference: float, sd: float, unit: str, sd_dof: float) -> Check:
-    """Return whether an estimate agrees with what was known ahead; `unit` is "rad" or "1"."""
+    """Return whether an estimate agrees with what was known ahead; `unit` is "rad", "rad/s" or "1"."""
     limit = student_t(FALSE_ALARM / 2.0, sd_dof) * sd
     passed = abs(difference) <= limit
-    factor, shown = (math.degrees(1.0), " deg") if unit == "rad" else (1.0, "")
+    factor, shown = {"rad": (math.degrees(1.0), " deg"), "rad/s": (1.0 / DPH, " deg/h")}.get(unit, (1.0, ""))
     verdict = "agrees" if passed else "does not agree"
     figures = f"it differs by {difference * factor:.3g}{shown}, limit {limit * factor:.2g}{shown}"
     sentence = f"the measured {name} {verdict} with the known one: {figures}"

@@ -245,22 +245,22 @@ def _checks(
     found += [checks.residuals(name, chi2, dof) for name, chi2, dof in fit.tests if dof]
     if vertical and known != _UNKNOWN:
         found += _agreements(nev, covariance, known, fit.sd_dof)
-    if not vertical and known.latitude is not None and known.scale_factor is not None:
-        found.append(_horizontal_agreement(nev, covariance, known.latitude, known.scale_factor, known, fit.sd_dof))
+    if not vertical:
+        found += _horizontal_agreement(nev, covariance, known, fit.sd_dof)
     return found
 
 
-def _horizontal_agreement(
-    nev: Array, covariance: Array, latitude: float, scale_factor: float, known: Known, sd_dof: float
-) -> checks.Check:
-    """Return whether the horizontal earth rate is that of the known latitude, as the gyro's scale factor shows it."""
+def _horizontal_agreement(nev: Array, covariance: Array, known: Known, sd_dof: float) -> list[checks.Check]:
+    """Return whether the horizontal earth rate is that of the known latitude, if the scale factor is known too."""
+    if known.latitude is None or known.scale_factor is None:
+        return []
     horizontal = math.hypot(nev[0], nev[1])
     direction = nev[:2] / horizontal
-    expected = EARTH_RATE * math.cos(latitude)
-    by_latitude = scale_factor * EARTH_RATE * math.sin(latitude) * known.latitude_sd
+    per_scale = EARTH_RATE * math.cos(known.latitude)
+    per_latitude = known.scale_factor * EARTH_RATE * math.sin(known.latitude)
     measured_sd = math.sqrt(max(float(direction @ covariance[:2, :2] @ direction), 0.0))
-    sd = math.hypot(measured_sd, expected * known.scale_factor_sd, by_latitude)
-    return checks.agreement("earth rate", horizontal - scale_factor * expected, sd, "rad/s", sd_dof)
+    sd = math.hypot(measured_sd, per_scale * known.scale_factor_sd, per_latitude * known.latitude_sd)
+    return [checks.agreement("earth rate", horizontal - known.scale_factor * per_scale, sd, "rad/s", sd_dof)]
 
 
 def _agreements(nev: Array, covariance: Array, known: Known, sd_dof: float) -> list[checks.Check]:
