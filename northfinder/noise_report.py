@@ -74,6 +74,7 @@ def save_profile(path: Path, name: str, series: RateSeries, identified: Identifi
     lines = [
         f"# Noise identified from {series.duration:.0f} s at {series.sample_rate:g} Hz.",
         f"name = {json.dumps(printable(name))}",
+        "# Not known: acceleration_sensitive_drift_rate_dph_per_g, scale_factor.",
         "",
         "[noise]",
     ]

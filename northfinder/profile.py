@@ -49,7 +49,7 @@ class GyroProfile(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
 
     name: str
     noise: NoiseTable
-    acceleration_sensitive_drift_rate_dph_per_g: float = 0.0
+    acceleration_sensitive_drift_rate_dph_per_g: float | None = None  #: None if it is not known
     acceleration_sensitive_drift_rate_sd_dph_per_g: float = 0.0
     scale_factor: float | None = None
     scale_factor_sd: float = 0.0

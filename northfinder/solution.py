@@ -15,6 +15,7 @@ from northfinder.estimation.calibration import with_ratio
 from northfinder.estimation.disturbance import undisturbed
 from northfinder.estimation.geometry import wrapped
 from northfinder.estimation.least_squares import Weights
+from northfinder.estimation.propagation import gains
 from northfinder.profile import GyroProfile, NoiseTable, find_profile
 from northfinder.published import published_json
 from northfinder.units import ARCSEC, DPH
@@ -101,6 +102,12 @@ class Assumptions:
         table = self.profile.noise
         return NoiseModel.from_field_units(**{name: getattr(table, name) for name in table.__struct_fields__})
 
+    @property
+    def drift_rate_known(self) -> bool:
+        """Whether anything tells the acceleration-sensitive drift rate; it is taken as zero otherwise."""
+        told = self.g_drift_dph is not None or self.calibration is not None
+        return told or self._profile().acceleration_sensitive_drift_rate_dph_per_g is not None
+
     def _profile(self) -> GyroProfile:
         return GyroProfile(name="", noise=NoiseTable()) if self.profile is None else self.profile
 
@@ -122,7 +129,7 @@ class Assumptions:
             return table.drift_rate_dph_per_g, table.drift_rate_sd_dph_per_g
         profile = self._profile()
         return (
-            profile.acceleration_sensitive_drift_rate_dph_per_g,
+            profile.acceleration_sensitive_drift_rate_dph_per_g or 0.0,
             profile.acceleration_sensitive_drift_rate_sd_dph_per_g,
         )
 
@@ -201,7 +208,18 @@ def supplement(means: RateMeans, assumptions: Assumptions, fix: Fix) -> dict[str
         weights=problem.weights, declared=assumptions.declared(),
     )  # fmt: skip
     published = published_json(means, problem.noise, fix)
-    return {"budget": budget_to_json(budget)} | published | calibration_to_json(assumptions)
+    said = {"budget": budget_to_json(budget), "notes": notes(assumptions, fix)}
+    return said | published | calibration_to_json(assumptions)
+
+
+def notes(assumptions: Assumptions, fix: Fix) -> list[str]:
+    """Return in sentences what the operator ought to know of the assumptions behind a fix of `solve`."""
+    known = assumptions.known()
+    if assumptions.drift_rate_known or fix.latitude is None or known.latitude is not None:
+        return []
+    shift = abs(float(gains(fix, known, azimuth=fix.azimuth, vertical=True).rates[1, 2])) * DPH
+    effect = f"each deg/h per g of it shifts the latitude by {math.degrees(shift):.2g} deg"
+    return [f"the acceleration-sensitive drift rate is not known and taken as zero: {effect}"]
 
 
 def calibration_to_json(assumptions: Assumptions) -> dict[str, Any]:

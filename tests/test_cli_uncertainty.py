@@ -26,6 +26,11 @@ def northfinder(*arguments: object) -> str:
     return done.stdout
 
 
+def shown(*arguments: object) -> str:
+    """Run a command and return what people see, without borders and line breaks."""
+    return " ".join(northfinder(*arguments).replace("│", " ").split())
+
+
 def as_json(*arguments: object) -> dict[str, Any]:
     """Run a command and return its JSON."""
     found: dict[str, Any] = json.loads(northfinder(*arguments, "--json"))
@@ -94,8 +99,8 @@ def test_calibrate_finds_the_constants_and_says_what_it_rests_on(records: list[P
     everywhere = as_json("calibrate", *records, *["--latitude", 50.429] * 3, "--latitude", 30.0)
     assert everywhere["supported"] == "acceleration-sensitive"
     assert "support" in everywhere["verdict"]
-    shown = " ".join(northfinder("calibrate", *records[:3], "--latitude", 50.429).split())
-    assert "measure at another one to tell them apart" in shown
+    table = shown("calibrate", *records[:3], "--latitude", 50.429)
+    assert "measure at another one to tell them apart" in table
 
 
 def test_a_calibration_is_applied_and_reported(records: list[Path], calibration: Path, tmp_path: Path) -> None:
@@ -167,3 +172,41 @@ def test_a_wrong_latitude_without_a_vertical_plane_is_caught(tmp_path: Path) -> 
     with pytest.raises(EstimateError, match="no trustworthy estimate: the measured earth rate does not agree") as wrong:
         northfinder("solve", record, "--profile", profile, "--latitude", 60.429)
     assert exit_code(wrong.value) == 4
+
+
+def test_a_drift_rate_that_nobody_knows_is_said(records: list[Path], calibration: Path, tmp_path: Path) -> None:
+    """The shift of the latitude in the note is what 1 deg/h per g does; told in any way, 0 too, there is no note."""
+    mine, zero = tmp_path / "mine.toml", tmp_path / "zero.toml"
+    noise = "[noise]\nangle_white_noise_dph_s = 0.764\nbias_instability_dph = 0.06\n"
+    mine.write_text(f'name = "mine"\n{noise}')
+    zero.write_text(f'name = "zero"\nacceleration_sensitive_drift_rate_dph_per_g = 0.0\n{noise}')
+    unknown = as_json("solve", records[0], "--profile", mine)
+    (note,) = unknown["notes"]
+    assert note.startswith("the acceleration-sensitive drift rate is not known and taken as zero: each deg/h per g")
+    shift = float(note.split()[-2])
+    moved = as_json("solve", records[0], "--profile", mine, "--g-drift", 1.0)
+    assert unknown["latitude_deg"] - moved["latitude_deg"] == pytest.approx(shift, rel=0.1)
+    assert moved["notes"] == []
+    assert as_json("solve", records[0], "--profile", zero)["latitude_deg"] == unknown["latitude_deg"]
+    for told in (("--profile", zero), ("--profile", mine, "--calibration", calibration), ("--profile", "tvg43")):
+        assert as_json("solve", records[0], *told)["notes"] == []
+    entered = as_json("solve", records[0], "--profile", mine, "--latitude", 50.429, "--latitude-sd", 20.0)
+    assert entered["notes"] == []
+    assert "note the acceleration-sensitive drift rate is not known" in shown("solve", records[0], "--profile", mine)
+    assert "not known and taken as zero" in shown("budget", "--profile", mine, "--time", 120, "--latitude", 50)
+
+
+def test_a_latitude_given_exactly_is_shown_as_given(records: list[Path]) -> None:
+    """No plus-minus of zero; one given within a standard deviation keeps it."""
+    assert "latitude 50.429 deg, as given" in shown("solve", records[0], "--latitude", 50.429)
+    assert "as given" not in shown("solve", records[0], "--latitude", 50.429, "--latitude-sd", 0.1)
+
+
+def test_residuals_larger_than_usual_are_said_in_those_words(records: list[Path], tmp_path: Path) -> None:
+    """By how much the plus-minus are widened, after a profile that promises far too little noise."""
+    calm = tmp_path / "calm.toml"
+    calm.write_text('name = "calm"\n[noise]\nangle_white_noise_dph_s = 0.1\n')
+    factor = as_json("solve", records[0], "--profile", calm)["rescaled_by"]
+    assert factor > 2.0
+    panel = shown("solve", records[0], "--profile", calm)
+    assert f"widened residuals are larger than usual: the ± are widened {factor:.2f} times" in panel

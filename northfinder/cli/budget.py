@@ -99,3 +99,5 @@ def command(
     Console().print(budget_table(result["budget"], title=title))
     if result["latitude_deg"] is None:
         Console().print(f"latitude: {result['latitude_reason']}")
+    for note in result["notes"]:
+        Console().print(f"note: {note}")

@@ -28,6 +28,8 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     table.add_row("azimuth", f"[bold]{_with_sd(result['azimuth_deg'], result['azimuth_sd_deg'])}[/bold]")
     if result["latitude_deg"] is None:
         table.add_row("latitude", f"not measured: {result['latitude_reason']}")
+    elif result["latitude_sd_deg"] == 0:
+        table.add_row("latitude", f"{result['latitude_deg']:.3f} deg, as given")
     else:
         table.add_row("latitude", f"[bold]{_with_sd(result['latitude_deg'], result['latitude_sd_deg'])}[/bold]")
     if truth is not None:
@@ -52,12 +54,14 @@ def _notes(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if result["n_rejected"]:
         yield "left out", f"{result['n_rejected']} disturbed seconds"
     if result["rescaled_by"] > 1:
-        yield "widened", f"the residuals do not fit the profile: the ± are {result['rescaled_by']:.2f} times its"
+        yield "widened", f"residuals are larger than usual: the ± are widened {result['rescaled_by']:.2f} times"
     if "budget" in result:
         yield "uncertainty", f"of the azimuth, the largest parts: {largest(result['budget'])} deg"
     if "calibration" in result:
         applied = result["calibration"]
         yield "calibration", f"of {applied['date']}, valid until {applied['valid_until']}: {applied['model']}"
+    for note in result.get("notes", []):
+        yield "note", note
 
 
 def require_trustworthy(result: Mapping[str, Any]) -> None:
