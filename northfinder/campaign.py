@@ -19,7 +19,7 @@ from northfinder.estimation.campaign import (
     longest_gap,
 )
 from northfinder.record import Record
-from northfinder.record_facts import RecordFacts, facts_of
+from northfinder.record_facts import RecordFacts, facts_of, require_complete
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, Problem, solve
 from northfinder.solve_file import kept_assumptions
@@ -44,6 +44,7 @@ class Member:
 def read_member(path: Path, revise: Callable[[Assumptions], Assumptions] = lambda kept: kept) -> Member:
     """Read and estimate one record. Raises RecordError, and EstimateError naming the record."""
     with Record(path) as record:
+        require_complete(record)
         assumptions = revise(kept_assumptions(record))
         facts = facts_of(record)
         simulation = record.meta("simulation")

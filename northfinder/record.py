@@ -185,6 +185,11 @@ class Record:
         with _one_line(self.path, "read"):
             return self._db.execute("SELECT time, kind, detail FROM event ORDER BY id").fetchall()
 
+    def is_complete(self) -> bool:
+        """Return whether the measurement went on to its fix, rather than ending early."""
+        with _one_line(self.path, "read"):
+            return bool(self._db.execute("SELECT count(*) FROM fix").fetchone()[0])
+
     def fixes(self) -> list[Any]:
         """Return what was estimated, oldest first."""
         with _one_line(self.path, "read"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 
@@ -51,6 +52,30 @@ def facts_of(record: Record) -> RecordFacts:
         device_times=(times[0], times[-1]),
         temperatures=(min(warm), max(warm)) if warm else None,
     )
+
+
+def require_complete(record: Record) -> None:
+    """Raise RecordError if the measurement ended before its fix: such data are not to be averaged with others."""
+    if not record.is_complete():
+        raise RecordError(
+            f"the record {record.path} ends before its measurement did, after {_steps_done(record)}: "
+            "expected one of a whole measurement, with its fix"
+        )
+
+
+def completeness(record: Record) -> dict[str, Any]:
+    """Return whether the record holds a whole measurement, and how much of it in words."""
+    return {"complete": record.is_complete(), "steps": _steps_done(record)}
+
+
+def _steps_done(record: Record) -> str:
+    """Return how many steps were finished, of how many if the plan tells.
+
+    An outline holds the steps itself or in its cyclogram.
+    """
+    plan = record.meta("plan") or {}
+    planned = len((plan.get("cyclogram") or plan).get("steps", []))
+    return f"{len(record.steps())} of the {planned} steps" if planned else f"{len(record.steps())} steps"
 
 
 def gyro_identity(record: Record) -> DeviceIdentity | None:

@@ -14,7 +14,7 @@ from northfinder.estimation.double_gyrocompass import solve_triad
 from northfinder.estimation.dwell_table import solve_dwell_table
 from northfinder.estimation.triad import static_mean
 from northfinder.record import Record
-from northfinder.record_facts import gyro_identity, record_date
+from northfinder.record_facts import completeness, gyro_identity, record_date
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, fix_to_json, solve, supplement
 from northfinder.table_report import dwell_table_json, triad_json
@@ -80,7 +80,8 @@ def solve_record(
         means = reduce_record(record).means()
         fix = solve(means, assumptions)
         plan = record.meta("plan") or {}
-    return fix_to_json(fix) | supplement(means, assumptions, fix) | {"plan": plan.get("name"), "record": str(path)}
+        about = {"plan": plan.get("name"), "record": str(path)} | completeness(record)
+    return fix_to_json(fix) | supplement(means, assumptions, fix) | about
 
 
 def kept_assumptions(record: Record) -> Assumptions:

@@ -11,10 +11,12 @@ import pytest
 from click.testing import CliRunner
 from virtual import virtual_bench
 
+from drivers.errors import DeviceFaultError
 from northfinder.calibration import read_calibration
 from northfinder.cli import cli, exit_code
 from northfinder.cyclogram import four_position, six_position
 from northfinder.errors import ConfigError, EstimateError, NorthFinderError, RecordError
+from northfinder.record import Record
 
 
 def northfinder(*arguments: object) -> str:
@@ -210,3 +212,23 @@ def test_residuals_larger_than_usual_are_said_in_those_words(records: list[Path]
     assert factor > 2.0
     panel = shown("solve", records[0], "--profile", calm)
     assert f"widened residuals are larger than usual: the ± are widened {factor:.2f} times" in panel
+
+
+def test_a_record_that_ends_early_is_solved_but_serves_nothing_else(records: list[Path], tmp_path: Path) -> None:
+    """Solve says how far it went; calibrate and stats refuse it by name. A whole one is complete."""
+    broken = tmp_path / "broken.sqlite"
+    with pytest.raises(DeviceFaultError):
+        virtual_bench(seed=12, faults=("stage:e-stop@130",)).measure(broken, six_position(20.0))
+    assert as_json("solve", records[0])["complete"] is True
+    assert "ends before" not in shown("solve", records[0])
+    early = as_json("solve", broken)
+    assert early["complete"] is False
+    with Record(broken) as record:
+        said = f"ends before the measurement did, {len(record.steps())} of the 8 steps"
+        assert 3 <= len(record.steps()) < 8
+    assert f"record {said}" in shown("solve", broken)
+    for command in (("calibrate", records[0], broken, "--latitude", 50.429), ("stats", records[0], broken)):
+        with pytest.raises(
+            RecordError, match=r"broken\.sqlite ends before its measurement did, after \d of the 8 steps"
+        ):
+            northfinder(*command)

@@ -45,6 +45,8 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     if "n_samples" in result:
         table.add_row("samples", f"{result['n_samples']} in {result['duration_s']:.1f} s, {result['n_lost']} lost")
     if "record" in result:
+        if not result.get("complete", True):
+            table.add_row("record", f"[red]ends before the measurement did, {result['steps']}[/red]")
         table.add_row("record", printable(result["record"]))
     Console().print(Panel(table, title="true north", expand=False))
 
