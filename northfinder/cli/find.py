@@ -156,7 +156,8 @@ class Options:
         return Config(gyro=GyroTable(address=self.gyro_address), stage=StageTable(address=self.stage_address))
 
     def truth(self) -> SimulationOptions:
-        """Return the world to emulate; without a seed another one each time."""
+        """Return the world to emulate; without a seed another one each time. Raises ConfigError."""
+        _check_speed(self.speed)
         return SimulationOptions(
             azimuth_deg=self.sim_azimuth,
             latitude_deg=self.sim_latitude,
@@ -194,6 +195,17 @@ class Options:
             until_sd=None if until_sd_deg is None else math.radians(until_sd_deg),
             azimuth=None if azimuth_deg is None else math.radians(azimuth_deg),
         )
+
+
+def _check_speed(text: str) -> None:
+    from sim_device.server import parse_speed  # noqa: PLC0415  # not needed with devices
+
+    try:
+        possible = parse_speed(text) >= 1.0
+    except ValueError:
+        possible = False
+    if not possible:
+        raise ConfigError(f"--speed: found {text!r}, expected a number of at least 1, or max")
 
 
 def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, as_json: bool) -> None:
