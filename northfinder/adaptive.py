@@ -31,7 +31,7 @@ class Wishes:
     """What the operator asks of a plan; None where nothing is asked. Times in s, angles in rad."""
 
     name: str | None = None  #: a built-in plan, or a TOML file of a cyclogram
-    dwell: float | None = None  #: of each step of a built-in cyclogram
+    dwell: float | None = None  #: of each step of a built-in cyclogram; a file has dwells of its own
     time: float | None = None  #: from the first slew to the end of the last dwell
     until_sd: float | None = None  #: standard deviation of the azimuth that is enough
     azimuth: float | None = None  #: roughly known true azimuth of stage azimuth zero
@@ -147,6 +147,8 @@ def _check_wishes(name: str, wishes: Wishes, *, searchable: bool) -> None:
         raise ConfigError(f"no plan {name!r}: expected {', '.join(PLANS)}, or a TOML file of a cyclogram")
     if wishes.dwell is not None and wishes.time is not None:
         raise ConfigError("a dwell and a time cannot both be given: the time says how long the dwells are")
+    if wishes.dwell is not None and name not in PLANS:
+        raise ConfigError(f"the plan {name} has dwells of its own: give --time to stretch them, not --dwell")
     if name == "double" and wishes.azimuth is None:
         raise ConfigError("the plan double starts from a roughly known azimuth: give --azimuth")
     if name in PLANS and name not in BUILT_IN and not searchable:

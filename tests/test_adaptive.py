@@ -245,6 +245,24 @@ def test_true_azimuths_from_a_file(tmp_path: Path) -> None:
     assert not step.from_north
 
 
+def test_a_dwell_is_refused_where_the_file_says_the_dwells(tmp_path: Path) -> None:
+    """Not ignored; a time does stretch the file's dwells."""
+    file = tmp_path / "own.toml"
+    file.write_text(
+        'name = "own"\n'
+        + "".join(
+            f"[[step]]\nname = 'U{i}'\nazimuth_deg = {90 * i}\nelevation_deg = 0\ndwell_s = 10\n" for i in range(4)
+        )
+    )
+    with pytest.raises(ConfigError, match=r"own\.toml has dwells of its own: give --time to stretch them, not --dwell"):
+        make_plan(Wishes(name=str(file), dwell=20.0), assume(), settle=0.5)
+    for wishes, dwell in ((Wishes(name=str(file)), 40.0), (Wishes(name=str(file), time=200.0), 150.0)):
+        plan = make_plan(wishes, assume(), settle=0.5)
+        plan.check(LIMITS)
+        assert plan.remaining_dwell(0) == pytest.approx(dwell, abs=25.0)
+        assert (plan.remaining_dwell(0) == 40.0) is (wishes.time is None)
+
+
 def test_a_plain_cyclogram_is_a_plan() -> None:
     """Its steps come one after the other as they stand."""
     steps = tuple(Step(name=f"U{i}", azimuth=float(i), elevation=0.0, dwell=5.0) for i in range(2))
