@@ -62,7 +62,7 @@ class CanopenGyro:
         self._sample_rate = self._range = 0.0
         self._n_axes = self._burst = self._block_samples = 0
         self._assembler = SampleAssembler(1, 1.0, 1)
-        self._streaming = False
+        self._streaming = self._connected = False
         self._n_acknowledged = 0
         self._heard_at = 0.0
         self._failure: DeviceError | None = None
@@ -100,7 +100,8 @@ class CanopenGyro:
             If it does not support the sample rate or burst asked for.
         """
         node = self._node
-        self._streaming, self._failure, self._n_axes = False, None, 0
+        self._streaming = self._connected = False
+        self._failure = None
         node.order("PRE-OPERATIONAL")  # which stops a stream
         who = identify(node, "gyro")
         self._configure()
@@ -108,6 +109,7 @@ class CanopenGyro:
         node.command("OPERATIONAL", OPERATIONAL)
         node.emergencies.clear()
         node.watch()
+        self._connected = True
         return who
 
     def self_test(self) -> SelfTest:
@@ -118,7 +120,7 @@ class CanopenGyro:
         """Start the sample stream; the index of its first sample is 0. A stream under way goes on."""
         if self._streaming:
             return
-        if not self._n_axes:
+        if not self._connected:
             raise LinkError(f"{self._node.name} cannot start: connect first")
         self._node.service()
         self._frames()  # of a stream before
@@ -163,12 +165,12 @@ class CanopenGyro:
         try:
             if self._streaming:
                 self._node.write(_STREAM, 0, 0)
-            if self._n_axes:
+            if self._connected:
                 self._node.order("PRE-OPERATIONAL")
         except DeviceError:
             pass  # the link is on its way out; an unread gyro does no harm
         finally:
-            self._streaming = False
+            self._streaming = self._connected = False
             self._node.close()
 
     def _configure(self) -> None:
