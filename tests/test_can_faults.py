@@ -101,6 +101,21 @@ def test_error_frames_point_to_the_bit_rate() -> None:
         bench.open_gyro().connect()
 
 
+def test_a_stray_answer_holds_up_no_wait() -> None:
+    """An SDO answer that nobody asked for, in the place of a heartbeat, lets the wait for the node end in its time."""
+    bench = can_bench()
+
+    def stray(identifier: int, data: bytes) -> list[tuple[int, bytes]]:
+        started = bench.tap.asked[-1][1] == 0
+        return [(0x590, bytes(8))] if started and identifier == 0x710 else [(identifier, data)]
+
+    gyro = bench.open_gyro()
+    bench.tap.to_host = stray
+    with pytest.raises((DeviceTimeoutError, ProtocolError)):
+        gyro.connect()
+    assert bench.clock.now() < 3.0
+
+
 class Twin:
     """A second gyro of the same number, made of the same firmware, beside the bench."""
 

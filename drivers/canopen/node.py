@@ -94,13 +94,14 @@ class Node:
 
     # What arrives
 
-    def service(self) -> None:
-        """Do the other duty, and sort what has arrived. Never waits."""
+    def service(self) -> bool:
+        """Do the other duty, and sort what has arrived; return whether anything has. Never waits."""
         self.duty()
         now = self._clock.now()
         self._silence += min(now - self._looked_at, LONGEST_LOOK)
         self._looked_at = now
-        for identifier, data in self._link.receive():
+        frames = self._link.receive()
+        for identifier, data in frames:
             waiting = self._pdos.get(identifier)
             if waiting is not None:
                 if len(waiting) < MAX_WAITING:
@@ -109,6 +110,7 @@ class Node:
                 self._network.notify(identifier, bytearray(data), now)
             else:
                 self.n_malformed += 1
+        return bool(frames)
 
     def _is_odd(self, identifier: int, data: bytes) -> bool:
         """Return whether a frame is a heartbeat with a state that there is not."""
@@ -116,10 +118,8 @@ class Node:
 
     def wait(self, deadline: float) -> None:
         """Service until something has come, or `deadline`, or a service period has gone by."""
-        self.service()
-        now = self._clock.now()
-        if self.remote.sdo.responses.empty() and now < deadline:
-            self._clock.wait(min(deadline, now + SERVICE_PERIOD))
+        if not self.service():
+            self._clock.wait(min(deadline, self._clock.now() + SERVICE_PERIOD))
             self.service()
 
     def collect(self, *cob_ids: int) -> None:
