@@ -106,7 +106,7 @@ def test_a_stray_answer_holds_up_no_wait() -> None:
     bench = can_bench()
 
     def stray(identifier: int, data: bytes) -> list[tuple[int, bytes]]:
-        started = bench.tap.asked[-1][1] == 0
+        started = bench.tap.asked[-1][1:] == (0, bytes([1, GYRO_ID]))
         return [(0x590, bytes(8))] if started and identifier == 0x710 else [(identifier, data)]
 
     gyro = bench.open_gyro()
