@@ -11,7 +11,9 @@ point. A step is a gap, then an interval whose mean is observed.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,9 @@ from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import Components, NoiseModel, components, mean_variance
 
 Array = NDArray[np.float64]
+
+#: The filter is kept for so many means at the most, half an hour of seconds; 0.3 kB each.
+KEPT_MEANS = 2000
 
 
 def whiten(noise: NoiseModel, means: RateMeans, columns: Array) -> Array:
@@ -44,31 +49,48 @@ def whiten(noise: NoiseModel, means: RateMeans, columns: Array) -> Array:
         The noise model predicts a mean without error, as one that is all zero does.
     """
     model = _StateSpace(noise, components(noise, means))
-    steps = _steps(model, means)
     state = np.zeros((model.n_states, columns.shape[1]))
-    cov = model.initial_covariance()
     whitened = np.empty(columns.shape)
-    for i, (transition, process) in enumerate(steps):
-        joint = transition @ cov @ transition.T + process  # of the mean and the state at its end
+    of_model = _kept_filter if means.n <= KEPT_MEANS else _filter
+    for i, (transition, gain, sd) in enumerate(of_model(model, _timing(means))):
         predicted = transition @ state
+        innovation = columns[i] - predicted[0]
+        whitened[i] = innovation / sd
+        state = predicted[1:] + gain * innovation
+    return whitened
+
+
+#: Gap before a mean, whether it shares an end point with the one before, and its duration, in s.
+_Timing = tuple[tuple[float, bool, float], ...]
+#: Transition to (mean, state at its end), gain of the mean's innovation, standard deviation of the innovation.
+_FilterStep = tuple[Array, Array, float]
+
+
+def _timing(means: RateMeans) -> _Timing:
+    gaps = np.concatenate([[0.0], np.round(means.gap, 9)]).tolist()
+    linked = np.concatenate([[True], means.gap == 0.0]).tolist()
+    return tuple(zip(gaps, linked, means.duration.tolist(), strict=True))
+
+
+def _filter(model: _StateSpace, timing: _Timing) -> Iterator[_FilterStep]:
+    """Yield the steps of the filter, which do not depend on what was measured; equal intervals share a transition."""
+    known = {key: model.step(*key) for key in set(timing)}
+    cov = model.initial_covariance()
+    for i, key in enumerate(timing):
+        transition, process = known[key]
+        joint = transition @ cov @ transition.T + process  # of the mean and the state at its end
         variance = joint[0, 0]
         if not variance > 0.0:
             raise ValueError(f"the noise model leaves mean {i} without error: give it a positive coefficient")
         gain = joint[1:, :1] / variance
-        innovation = columns[i] - predicted[0]
-        whitened[i] = innovation / variance**0.5
-        state = predicted[1:] + gain * innovation
         cov = joint[1:, 1:] - gain * joint[0, 1:]
-    return whitened
+        yield transition, gain, variance**0.5
 
 
-def _steps(model: _StateSpace, means: RateMeans) -> list[tuple[Array, Array]]:
-    """Return transition and process noise of each step; equal steps share theirs."""
-    gaps = np.concatenate([[0.0], np.round(means.gap, 9)]).tolist()
-    linked = np.concatenate([[True], means.gap == 0.0]).tolist()
-    keys = list(zip(gaps, linked, means.duration.tolist(), strict=True))
-    known = {key: model.step(*key) for key in set(keys)}
-    return [known[key] for key in keys]
+@lru_cache(maxsize=8)
+def _kept_filter(model: _StateSpace, timing: _Timing) -> list[_FilterStep]:
+    """Return the steps of the filter, kept for the next data with the same timing: another cycle, or another fit."""
+    return list(_filter(model, timing))
 
 
 @dataclass(frozen=True, slots=True)
