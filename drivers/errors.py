@@ -8,7 +8,8 @@ Every exception a driver or a transport raises on purpose is a `DeviceError`:
      +-- ProtocolError        bytes came that this protocol does not allow: wrong device, wrong version, refused request
      +-- DeviceFaultError     the device itself reports a fault, or refuses because of one
 
-A caller's mistake is a ValueError or a TypeError. Exceptions of third-party libraries stop at ``drivers.transport``.
+A caller's mistake is a ValueError or a TypeError. Exceptions of third-party libraries stop at ``drivers.transport``,
+those of canopen at ``drivers.canopen``.
 A message says what was asked, what came, and what to do next.
 """
 
