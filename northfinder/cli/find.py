@@ -145,6 +145,9 @@ class Options:
 
     def bench(self) -> Config | None:
         """Return the bench that was named, None if none was. Raises ConfigError."""
+        named = self.config_file or self.gyro_address or self.stage_address
+        if named and (self.seed is not None or self.bus is not None):
+            raise ConfigError("--seed and --bus are of the emulated bench: leave them out where devices are named")
         if self.config_file is not None:
             if self.gyro_address or self.stage_address:
                 raise ConfigError("--config names the devices: leave --gyro and --stage out")
