@@ -145,6 +145,8 @@ class RateBlock:
     rate_lsb: float  #: rad/s per count
     temperature: float | None = None  #: degrees Celsius
     tilt: tuple[float, float] | None = None  #: rad, see the convention sheet in ``northfinder``
+    #: m/s^2, mean over the block along the axes of a triad, its upward axis reading +g at rest; None if not measured
+    specific_force: tuple[float, float, float] | None = None
     status: GyroStatus = GyroStatus.OK
     n_lost: int = 0  #: samples missing between the previous block and this one, found from the index
 

@@ -39,7 +39,9 @@ CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE block (
     id INTEGER PRIMARY KEY, first_index INTEGER NOT NULL, n_samples INTEGER NOT NULL, n_axes INTEGER NOT NULL,
     device_time REAL NOT NULL, arrival_time REAL NOT NULL, rate_lsb REAL NOT NULL, dtype TEXT NOT NULL,
-    temperature REAL, tilt_x REAL, tilt_y REAL, status INTEGER NOT NULL, n_lost INTEGER NOT NULL,
+    temperature REAL, tilt_x REAL, tilt_y REAL,
+    specific_force_x REAL, specific_force_y REAL, specific_force_z REAL,
+    status INTEGER NOT NULL, n_lost INTEGER NOT NULL,
     crc INTEGER NOT NULL, counts BLOB NOT NULL);
 CREATE TABLE stage_state (
     id INTEGER PRIMARY KEY, device_time REAL NOT NULL, arrival_time REAL NOT NULL, mode TEXT NOT NULL,
@@ -134,7 +136,8 @@ class Record:
         """
         query = (
             "SELECT id, first_index, n_samples, n_axes, device_time, arrival_time, rate_lsb, dtype, temperature,"
-            " tilt_x, tilt_y, status, n_lost, crc, counts FROM block"
+            " tilt_x, tilt_y, specific_force_x, specific_force_y, specific_force_z,"
+            " status, n_lost, crc, counts FROM block"
             " WHERE first_index < ? AND first_index + n_samples > ? ORDER BY id"
         )
         with _one_line(self.path, "read"):
@@ -143,7 +146,7 @@ class Record:
 
     def _block(self, row: tuple[Any, ...]) -> RateBlock:
         number, first, n_samples, n_axes, device_time, arrival_time, lsb, dtype, temperature, x, y, *rest = row
-        status, n_lost, crc, data = rest
+        force_x, force_y, force_z, status, n_lost, crc, data = rest
         sound = (
             dtype in _DTYPES
             and isinstance(data, bytes)
@@ -161,6 +164,7 @@ class Record:
             rate_lsb=lsb,
             temperature=temperature,
             tilt=None if x is None or y is None else (x, y),
+            specific_force=None if None in {force_x, force_y, force_z} else (force_x, force_y, force_z),
             status=GyroStatus(status),
             n_lost=n_lost,
         )

@@ -74,10 +74,11 @@ class Recorder:
         data = counts.astype(counts.dtype.newbyteorder("<"), copy=False).tobytes()
         dtype = "<f4" if counts.dtype.kind == "f" else "<i4"
         tilt = block.tilt if block.tilt is not None else (None, None)
+        force = block.specific_force if block.specific_force is not None else (None, None, None)
         self._blocks.append(
             (
                 block.first_index, counts.shape[0], counts.shape[1], block.device_time, block.arrival_time,
-                block.rate_lsb, dtype, block.temperature, *tilt, int(block.status), block.n_lost,
+                block.rate_lsb, dtype, block.temperature, *tilt, *force, int(block.status), block.n_lost,
                 fastcrc.crc32.iscsi(data), data,
             )
         )  # fmt: skip
@@ -126,7 +127,7 @@ class Recorder:
         states, self._states = self._states, []
         if blocks or states:
             self._put(
-                ("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", blocks),
+                ("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", blocks),
                 ("INSERT INTO stage_state VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?)", states),
             )
 

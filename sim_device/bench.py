@@ -20,7 +20,7 @@ from sim_device.firmware.gyro import GyroDevice
 from sim_device.firmware.stage import StageDevice
 from sim_device.plant.boards import SimGyroBoard, SimStageBoard
 from sim_device.plant.earth import Site
-from sim_device.plant.gyro import STREAM_STAGE, STREAM_TILT, Gyro, seed_of
+from sim_device.plant.gyro import STREAM_ACCELEROMETERS, STREAM_STAGE, STREAM_TILT, Gyro, seed_of
 from sim_device.plant.noise import NoiseSource
 from sim_device.plant.profile import Profile, load_profile
 from sim_device.plant.stage import Stage
@@ -246,6 +246,7 @@ class World:
             self.plant_stage,
             serial_number=f"SIM-G{self.seed % 10**10}",
             tilt_rng=np.random.default_rng(seed_of(self.seed, STREAM_TILT, boot_count)),
+            accelerometer_rng=np.random.default_rng(seed_of(self.seed, STREAM_ACCELEROMETERS, boot_count)),
             epoch_us=self.now_us,
             boot_count=boot_count,
         )

@@ -184,6 +184,7 @@ def make_boards(tilt: tuple[float, float] = (0.0, 0.0)) -> tuple[SimGyroBoard, S
         stage,
         serial_number="G1",
         tilt_rng=np.random.default_rng(1),
+        accelerometer_rng=np.random.default_rng(1),
         epoch_us=0,
         boot_count=1,
     )
@@ -237,6 +238,7 @@ def test_noise_between_streams_goes_on_by_the_minute() -> None:
             stage,
             serial_number="G",
             tilt_rng=np.random.default_rng(1),
+            accelerometer_rng=np.random.default_rng(1),
             epoch_us=0,
             boot_count=1,
         )

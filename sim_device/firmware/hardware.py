@@ -60,6 +60,13 @@ class GyroBoard(Board):
         """Return (tilt_x, tilt_y) at the last `read_samples`."""
         raise NotImplementedError
 
+    def specific_force(self) -> tuple:  # type: ignore[type-arg]  # as tilt
+        """Return what three accelerometers along the gyro's axes read at the last `read_samples`, each in 1e-6 g.
+
+        At rest the upward axis reads +1 g.
+        """
+        raise NotImplementedError
+
 
 class StageBoard(Board):
     """The stage: two axes, 0 azimuth and 1 elevation, each with a position drive, an encoder and switches.

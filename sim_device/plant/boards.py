@@ -5,10 +5,13 @@ World time is in microseconds and the same for all devices; a board's clock star
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_device.firmware.hardware import GyroBoard, StageBoard
+from sim_device.plant.earth import project
 from sim_device.plant.gyro import ARCSEC, DPH, Gyro
 from sim_device.plant.stage import Stage
 
@@ -34,8 +37,8 @@ class SimGyroBoard(GyroBoard):
         What the gyro stands on; must have been driven up to the instant of each sample that is read.
     serial_number
         As answered to HELLO.
-    tilt_rng
-        Draws the noise of the tilt sensors.
+    tilt_rng, accelerometer_rng
+        Draw the noise of the tilt sensors and of the accelerometers.
     epoch_us, boot_count
         When this board started, in world time, and for which time.
 
@@ -48,6 +51,7 @@ class SimGyroBoard(GyroBoard):
         *,
         serial_number: str,
         tilt_rng: np.random.Generator,
+        accelerometer_rng: np.random.Generator,
         epoch_us: int,
         boot_count: int,
     ) -> None:
@@ -64,6 +68,7 @@ class SimGyroBoard(GyroBoard):
         self.newest_block_samples = 0
         self._stage = stage
         self._tilt_rng = tilt_rng
+        self._accelerometer_rng = accelerometer_rng
         self._epoch_us = epoch_us
         self._start_us = 0
         self._next = 0
@@ -143,6 +148,21 @@ class SimGyroBoard(GyroBoard):
             tilt_x += noise * self._tilt_rng.standard_normal()
             tilt_y += noise * self._tilt_rng.standard_normal()
         return round(tilt_x / ANGLE_LSB), round(tilt_y / ANGLE_LSB)
+
+    def specific_force(self) -> tuple[int, int, int]:
+        """Return what the accelerometers read at the middle of the last `read_samples`, 1e-6 g each."""
+        profile = self.gyro.profile.accelerometers
+        middle_us = int(
+            self._epoch_us + self.newest_block_us + 5e8 * self.newest_block_samples / self.sample_rate_millihz
+        )
+        azimuth, elevation = (axis.true_angle(middle_us) for axis in self._stage.axes)
+        up = project(self.gyro.site, np.eye(3), azimuth, elevation).up[0]
+        noise = profile.velocity_random_walk_mg_per_sqrt_hz * math.sqrt(
+            self.sample_rate_millihz / 1000 / max(1, self.newest_block_samples)
+        )
+        read = up * 1e3 + profile.bias_mg + noise * self._accelerometer_rng.standard_normal(3)
+        x, y, z = np.rint(read * 1e3)
+        return int(x), int(y), int(z)
 
 
 class SimStageBoard(StageBoard):

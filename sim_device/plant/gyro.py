@@ -18,7 +18,7 @@ DPH = math.radians(1.0) / 3600.0  #: rad/s in one deg/h
 ARCSEC = math.radians(1.0) / 3600.0  #: rad in one arc second
 
 #: First number of the spawn key of each random stream: the seed of a bench makes all of them, none depends on another.
-STREAM_TURN_ON, STREAM_NOISE, STREAM_STAGE, STREAM_TILT, STREAM_FAULTS = range(5)
+STREAM_TURN_ON, STREAM_NOISE, STREAM_STAGE, STREAM_TILT, STREAM_FAULTS, STREAM_ACCELEROMETERS = range(6)
 
 
 def seed_of(seed: int, *stream: int) -> np.random.SeedSequence:

@@ -50,6 +50,13 @@ class TemperatureProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unkno
     bias_coefficient_dph_per_c: float = 0.0
 
 
+class AccelerometerProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Three accelerometers along the gyro's axes."""
+
+    bias_mg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity_random_walk_mg_per_sqrt_hz: NotNegative = 0.0
+
+
 class GyroProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A gyro and its errors; a scalar holds for every axis."""
 
@@ -65,6 +72,7 @@ class GyroProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     acceleration_sensitive_drift_rate_dph_per_g: float = 0.0
     input_axis_misalignment_arcsec: list[tuple[float, float, float]] = []  #: rotation vector of each axis
     tilt_noise_arcsec: NotNegative = 0.0  #: sd of each reading of the tilt sensors
+    accelerometers: AccelerometerProfile = AccelerometerProfile()
     noise: NoiseProfile = NoiseProfile()
     recording: RecordingProfile | None = None
     temperature: TemperatureProfile = TemperatureProfile()
