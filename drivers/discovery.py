@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
+from inspect import Parameter, signature
 from typing import Any
 
 from drivers.api import Clock, DeviceIdentity, Gyro, Stage
@@ -77,4 +78,16 @@ def _open(group: str, kind: str, device: str, clock: Clock, options: dict[str, A
             f"write DRIVER:ADDRESS, for example {_EXAMPLE}"
         )
     factory: Callable[..., Any] = known[driver].load()
+    _check_options(driver, factory, options)
     return factory(address, clock, **options)
+
+
+def _check_options(driver: str, factory: Callable[..., Any], options: dict[str, Any]) -> None:
+    """Raise ValueError for an option that the driver does not take."""
+    parameters = list(signature(factory).parameters.values())[2:]  # after address and clock
+    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    taken = {parameter.name for parameter in parameters}
+    unknown = sorted(options.keys() - taken)
+    if unknown:
+        raise ValueError(f"the driver {driver!r} takes no option {unknown[0]!r}; it takes {', '.join(sorted(taken))}")

@@ -12,13 +12,21 @@ from drivers.api import StageLimits
 from northfinder.errors import ConfigError
 from northfinder.toml import read_toml
 
+#: What a driver may be told in a bench's file.
+Option = bool | int | float | str | list[float]
+
 
 class GyroTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """``[gyro]``: where the gyro is and which profile describes it."""
 
     address: str
     profile: str | None = None
-    baudrate: int = 921600
+    baudrate: int | None = None  #: the driver's default if not given
+    options: dict[str, Option] = {}  #: what its driver takes beside, see the driver's page in ``docs``
+
+    def driver_options(self) -> dict[str, Any]:
+        """Return what the gyro's driver is told beside its address."""
+        return dict(self.options) | _stated(baudrate=self.baudrate)
 
 
 class DriveTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
@@ -41,18 +49,20 @@ class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
     """``[stage]``: where the stage is, and limits narrower than its own."""
 
     address: str
-    baudrate: int = 921600
+    baudrate: int | None = None  #: the driver's default if not given
     azimuth_min_deg: float = -math.inf
     azimuth_max_deg: float = math.inf
     elevation_min_deg: float = -math.inf
     elevation_max_deg: float = math.inf
     max_speed_deg_s: float = math.inf
     drive: DriveTable | None = None
+    options: dict[str, Option] = {}  #: as in ``[gyro]``
 
-    def options(self) -> dict[str, Any]:
-        """Return what the stage's driver takes beyond baudrate and limits. Raises ConfigError if it takes no such."""
+    def driver_options(self) -> dict[str, Any]:
+        """Return what the stage's driver is told beside address and limits. Raises ConfigError if it takes no such."""
+        told = dict(self.options) | _stated(baudrate=self.baudrate)
         if self.drive is None:
-            return {}
+            return told
         if not self.address.startswith("cia402-stage:"):
             raise ConfigError(f"[stage.drive] is for a cia402-stage, not for {self.address}")
         from drivers.cia402 import DriveOptions  # noqa: PLC0415  # heavy, and only these stages need it
@@ -75,7 +85,7 @@ class StageTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
             )
         except ValueError as error:
             raise ConfigError(f"[stage.drive]: {error}") from None
-        return {"drive": options}
+        return told | {"drive": options}
 
     def limits(self) -> StageLimits:
         """Return the limits in rad; infinite where the device's own are to hold."""
@@ -115,3 +125,8 @@ def read_config(path: Path) -> Config:
 
 def _radians(angle_deg: float | None) -> float | None:
     return None if angle_deg is None else math.radians(angle_deg)
+
+
+def _stated(**options: object) -> dict[str, object]:
+    """Return those options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}

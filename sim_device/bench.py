@@ -12,12 +12,11 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from sim_device.firmware.gyro import GyroDevice
-from sim_device.firmware.stage import StageDevice
+from sim_device.instruments import GYROS, STAGES, Device, Hosted, instrument
 from sim_device.plant.boards import SimGyroBoard, SimStageBoard
 from sim_device.plant.earth import Site
 from sim_device.plant.gyro import STREAM_ACCELEROMETERS, STREAM_STAGE, STREAM_TILT, Gyro, seed_of
@@ -29,41 +28,14 @@ NOISE_BATCH = 8192  #: samples made at a time
 FIRST_BOOT = 1
 
 
-class Hosted(Protocol):
-    """What the firmware of any device says of its host, and when it has something to do, in the board's time."""
-
-    @property
-    def seen_time_us(self) -> int:
-        """Newest device time that the host says it has read."""
-
-    @property
-    def session(self) -> int:
-        """Number of the open session, 0 if none."""
-
-    @property
-    def testing(self) -> bool:
-        """Whether a self-test is under way."""
-
-    def next_due_us(self) -> int | None:
-        """Return when there will be something to do."""
-
-
-class Device(Hosted, Protocol):
-    """What the firmware of either device on a serial line offers, in the board's time."""
-
-    def feed(self, data: bytes, now_us: int) -> None:
-        """Take what came over the line."""
-
-    def poll(self, now_us: int) -> bytes:
-        """Do what is due and return what to send."""
-
-
 class Seat:
     """A device's place in the world: when it started, and when it will next do something."""
 
     def __init__(self, bench: World, name: str, device: Hosted) -> None:
         self.bench = bench
         self.name = name  #: what an operator calls the device, "gyro" or "stage"
+        self.acknowledged = True  #: whether the host says what it has read; else `unread` tells
+        self.unread = False  #: whether the host has still to read what the device has sent
         self.device = device
         self.epoch_us = 0  #: world time of the device's start
         self.due_us = device.next_due_us()  #: when the device will next do something, in world time; None if never
@@ -96,9 +68,10 @@ class Seat:
 class Line(Seat):
     """The host's end of one device's line."""
 
-    def __init__(self, bench: World, name: str, device: Device) -> None:
+    def __init__(self, bench: World, name: str, device: Device, *, acknowledged: bool = True) -> None:
         super().__init__(bench, name, device)
         self.device: Device = device
+        self.acknowledged = acknowledged
         self.room: int | None = None  #: bytes that the line can take now, None for any number; beyond, blocks are lost
         self._out = bytearray()
 
@@ -125,15 +98,11 @@ class Line(Seat):
     @property
     def told_us(self) -> int:
         """Device time of the newest status frame of a stage, -1 if there is none."""
-        return self.device.told_time_us if isinstance(self.device, StageDevice) else -1
+        return self.device.told_time_us
 
     def serve(self) -> None:
         """Let the device do what is due now."""
-        now_us = self.bench.now_us - self.epoch_us
-        if self.room is not None and isinstance(self.device, GyroDevice):
-            sent = self.device.poll(now_us, self.room)
-        else:
-            sent = self.device.poll(now_us)
+        sent = self.device.poll(self.bench.now_us - self.epoch_us, self.room)
         if sent:
             self._out += sent
         self._note_due()
@@ -261,19 +230,40 @@ class World:
 
 
 class SimBench(World):
-    """The bench with its serial firmware, each device on a line of its own. Takes what `World` takes."""
+    """The bench with serial firmware, each device on a line of its own.
+
+    Parameters
+    ----------
+    profile
+        Its name, the path of its file, or itself; the gyro's own if empty.
+    gyro, stage
+        Which instruments they are, see `sim_device.instruments`.
+    options
+        What `World` takes.
+
+    """
 
     gyro: Line
     lines: tuple[Line, ...]
 
-    def __init__(self, profile: str | Profile = "tvg43", **options: Any) -> None:  # noqa: ANN401 - those of World
-        super().__init__(profile, **options)
-        self.stage = Line(self, "stage", StageDevice(self.stage_board))
-        self.gyro = Line(self, "gyro", GyroDevice(self.gyro_board))
+    def __init__(
+        self,
+        profile: str | Profile = "",
+        *,
+        gyro: str = "native",
+        stage: str = "native",
+        **options: Any,  # noqa: ANN401 - those of World
+    ) -> None:
+        self._kinds = {"gyro": instrument(GYROS, "gyro", gyro), "stage": instrument(STAGES, "stage", stage)}
+        super().__init__(profile or self._kinds["gyro"].profile, **options)
+        self.stage = self._line("stage", self.stage_board)
+        self.gyro = self._line("gyro", self.gyro_board)
         self.lines = (self.stage, self.gyro)
 
+    def _line(self, name: str, board: SimGyroBoard | SimStageBoard) -> Line:
+        kind = self._kinds[name]
+        return Line(self, name, kind.firmware(board), acknowledged=kind.acknowledges)
+
     def _restart(self, name: str) -> None:
-        if name == "gyro":
-            self.gyro.restart(GyroDevice(self.gyro_board))
-        else:
-            self.stage.restart(StageDevice(self.stage_board))
+        line, board = (self.gyro, self.gyro_board) if name == "gyro" else (self.stage, self.stage_board)
+        line.restart(self._kinds[name].firmware(board))

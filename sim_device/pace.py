@@ -2,10 +2,11 @@
 
 At 1x world time is wall time. Faster, the world never runs slower than that, and runs ahead only while the host keeps
 up: it goes from one thing that is due to the next, and holds as soon as a device has sent a stream frame that its host
-must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. So a run at full speed is a lockstep with the host. When
-the host stays away, time goes on at 1x from there, and a dead host trips the stage's watchdog as in reality: after a
-quarter of a second with the stage at rest, where a lost frame may be all there is to it; after a second while it moves,
-so that a host which is merely busy finds the same world again.
+must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. Where hosts acknowledge nothing, it holds while they have
+not read what was sent, and for a stage that is polled, the last poll counts. So a run at full speed is a lockstep with
+the host. When the host stays away, time goes on at 1x from there, and a dead host trips the stage's watchdog as in
+reality: after a quarter of a second with the stage at rest, where a lost frame may be all there is to it; after a
+second while it moves, so that a host which is merely busy finds the same world again.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ MOVING_PATIENCE_US = 1_000_000  #: wall time for which the world waits for the h
 REST_PATIENCE_US = 250_000  #: the same with the stage at rest
 MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
+UNREAD_LOOK_US = 200  #: between looks at whether the host has read what it need not acknowledge
 CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
 
 
@@ -71,6 +73,8 @@ class Pace:
         due = self._next_us()
         if due is not None:
             return (due - self._bench.now_us) / self._speed
+        if self._speed > 1 and any(line.unread for line in self._bench.lines):
+            return UNREAD_LOOK_US  # nothing tells when a host has read
         next_due = self._bench.next_due_us()
         if next_due is None:
             return math.inf
@@ -102,7 +106,11 @@ class Pace:
     def _horizon_us(self, line: Seat) -> float:
         """Return up to when a line's host lets the world run ahead."""
         seen_us = line.device.seen_time_us
+        if not line.acknowledged and line.unread:
+            return -math.inf
         if line is self._bench.gyro:
+            if not line.acknowledged:
+                return math.inf
             awaited = self._bench.gyro_board.newest_block_us > seen_us
             return -math.inf if awaited else math.inf
         if line.told_us > seen_us:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import sys
 from typing import Protocol
 
 from sim_device.bench import Line
@@ -12,6 +13,7 @@ from sim_device.faults import Endpoint
 
 UART_BUFFER = 4096  #: bytes that a device holds back when its line is full
 READ_SIZE = 65_536
+UNREAD_BYTES = 512  #: beyond which a host that acknowledges nothing is waited for
 
 
 class Port(Protocol):
@@ -30,6 +32,9 @@ class Port(Protocol):
 
     def send(self, data: bytes) -> int:
         """Send as much of `data` as the line takes now; return how much that was."""
+
+    def unread(self) -> int:
+        """Return how many bytes the host has not read yet, as far as can be told."""
 
     def close(self) -> None:
         """Take the place away: the host sees the line go."""
@@ -60,6 +65,13 @@ class PtyPort:
             return os.write(self._master, data)
         except BlockingIOError:
             return 0
+
+    def unread(self) -> int:
+        """Return how many bytes the host has not read yet."""
+        import fcntl  # noqa: PLC0415 - as tty
+        import termios  # noqa: PLC0415 - as tty
+
+        return int.from_bytes(fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)), sys.byteorder)
 
     def close(self) -> None:
         """Hang up."""
@@ -109,6 +121,10 @@ class TcpPort:
         except OSError:
             self._hang_up()
             return len(data)
+
+    def unread(self) -> int:
+        """Return nothing: the network has taken what was sent, and does not tell whether the host has."""
+        return 0
 
     def close(self) -> None:
         """Hang up and listen no more."""
@@ -187,6 +203,8 @@ class Connection:
         if self._waiting:
             del self._waiting[: self.port.send(bytes(self._waiting))]
         self.line.room = UART_BUFFER - len(self._waiting)
+        if not self.line.acknowledged:
+            self.line.unread = len(self._waiting) + self.port.unread() > UNREAD_BYTES
         return bool(fresh)
 
     def _unplug(self) -> None:

@@ -26,6 +26,7 @@ from sim_device.can_bench import BITRATE, CanBench
 from sim_device.can_server import BUSES, BusConnection, schedule_bus
 from sim_device.can_server import open_port as open_bus_port
 from sim_device.faults import Endpoint, FaultSpec, FaultyLine, LinkFaults, link_faults, schedule
+from sim_device.instruments import GYROS, STAGES
 from sim_device.pace import Pace
 from sim_device.plant.gyro import ARCSEC
 from sim_device.ports import Connection, Port, PtyPort, TcpPort
@@ -38,7 +39,9 @@ LOOPBACK = "127.0.0.1"
 class ServeOptions:
     """What to serve, and how."""
 
-    profile: str = "tvg43"  #: name, or path of a TOML file
+    profile: str = ""  #: name, or path of a TOML file; the gyro's own if empty
+    gyro: str = "native"  #: which instruments, see `sim_device.instruments`
+    stage: str = "native"
     seed: int = 0
     azimuth_deg: float = 0.0  #: true azimuth of stage azimuth zero
     latitude_deg: float = 50.429
@@ -63,7 +66,7 @@ class Served:
 
 def make_bench(options: ServeOptions) -> SimBench:
     """Return the bench on serial lines that the options describe; ValueError if they do not make sense."""
-    return SimBench(options.profile, **_world(options))
+    return SimBench(options.profile, gyro=options.gyro, stage=options.stage, **_world(options))
 
 
 def _world(options: ServeOptions) -> dict[str, Any]:
@@ -98,7 +101,7 @@ def serve(options: ServeOptions, stop: threading.Event | None = None) -> None:
         threading.Thread(target=_watch_input, args=(stop,), daemon=True).start()
     try:
         with _stopped_by_signals(stop):
-            _announce(options, served.addresses)
+            _announce(options, served)
             _run(pace, served.bench, served.connections, stop)
     finally:
         for connection in served.connections:
@@ -111,12 +114,15 @@ def _open_lines(options: ServeOptions) -> Served:
     schedule(specs, bench)
     lines = [line for line in (bench.gyro, bench.stage) if options.only in {"", line.name}]
     connections = [Connection(line, _endpoint(line, specs, options.seed), _open_port(options)) for line in lines]
-    addresses = {connection.line.name: f"native:{connection.port.address}" for connection in connections}
+    drivers = {"gyro": options.gyro, "stage": options.stage}
+    addresses = {each.line.name: f"{drivers[each.line.name]}:{each.port.address}" for each in connections}
     return Served(bench, connections, addresses)
 
 
 def _open_bus(options: ServeOptions) -> Served:
-    bench = CanBench(options.profile, bitrate=options.bitrate, **_world(options))
+    if {options.gyro, options.stage} != {"native"}:
+        raise ValueError(f"a CAN bus carries the native bench alone, not {options.gyro} and {options.stage}")
+    bench = CanBench(options.profile or GYROS["native"].profile, bitrate=options.bitrate, **_world(options))
     bench.lines = tuple(seat for seat in bench.lines if options.only in {"", seat.name})
     schedule_bus([FaultSpec.parse(text) for text in options.faults], bench)
     connection = BusConnection(bench, open_bus_port(bench, options.bus, options.tcp or LOOPBACK))
@@ -177,15 +183,15 @@ def _open_port(options: ServeOptions) -> Port:
         return TcpPort(LOOPBACK)
 
 
-def _announce(options: ServeOptions, addresses: dict[str, str]) -> None:
+def _announce(options: ServeOptions, served: Served) -> None:
     facts = {
-        "profile": options.profile,
+        "profile": options.profile or served.bench.profile.name,
         "seed": options.seed,
         "azimuth_deg": options.azimuth_deg,
         "latitude_deg": options.latitude_deg,
         "pid": os.getpid(),
     }
-    sys.stdout.write(json.dumps({**addresses, **facts}) + "\n")
+    sys.stdout.write(json.dumps({**served.addresses, **facts}) + "\n")
     sys.stdout.flush()
 
 
@@ -225,7 +231,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m sim_device", description="Emulate a gyro on a rotation stage.")
     add = parser.add_argument
-    add("--profile", default="tvg43", help="profile's name, or the path of its TOML file")
+    add("--profile", default="", help="profile's name, or the path of its TOML file; the gyro's own if not given")
+    add("--gyro", choices=sorted(GYROS), default="native", help="which instrument the gyro is")
+    add("--stage", choices=sorted(STAGES), default="native", help="which instrument the stage is")
     add("--seed", type=int, default=0)
     add("--azimuth", type=float, default=0.0, help="true azimuth of stage azimuth zero, deg")
     add("--latitude", type=float, default=50.429, help="deg, north positive")
@@ -240,6 +248,8 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     options = ServeOptions(
         profile=given.profile,
+        gyro=given.gyro,
+        stage=given.stage,
         seed=given.seed,
         azimuth_deg=given.azimuth,
         latitude_deg=given.latitude,

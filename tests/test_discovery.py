@@ -143,3 +143,9 @@ def test_an_unknown_driver_lists_the_known_ones() -> None:
 def test_the_native_driver_is_an_entry_point(group: str, function: str) -> None:
     """Our own driver comes in by the same door as anyone else's."""
     assert EntryPoint("native", f"drivers.native:{function}", group) in tuple(entry_points(group=group))
+
+
+def test_an_option_unknown_to_the_driver_is_named() -> None:
+    """A bench's file with a mistyped option says which one, and what the driver takes."""
+    with pytest.raises(ValueError, match="the driver 'native' takes no option 'blocksize'; it takes baudrate"):
+        open_gyro("native:/dev/null", SystemClock(), blocksize=3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ from sim_device.faults import FaultSpec, schedule
 from sim_device.plant.earth import EARTH_RATE
 from sim_device.plant.gyro import ARCSEC, DPH
 from sim_device.plant.noise import RecordedNoise
+from sim_device.plant.profile import AccelerometerProfile, load_profile
 
 SECOND = 1_000_000
 
@@ -276,3 +278,24 @@ def test_gyro_sensor_fault_is_reported() -> None:
     host.run(2.0)
     assert [block.status for block in host.samples[:4]] == [0, 0, 0, 0]
     assert host.samples[-1].status == 4
+
+
+def test_an_instrument_that_nobody_made_is_named() -> None:
+    """A kind of gyro or stage unknown to the emulator is refused with those it knows."""
+    with pytest.raises(ValueError, match=r"no emulated stage 'lathe': expected one of .*native"):
+        SimBench(stage="lathe")
+
+
+def test_accelerometers_feel_the_vertical() -> None:
+    """A level stage shows gravity on the z axis pointing down, a tipped one on the input axis, and biases as they are."""
+    profile = load_profile("fast3")
+    sensors = AccelerometerProfile(bias_mg=(1.0, -2.0, 3.0))
+    bench = SimBench(
+        msgspec.structs.replace(profile, gyro=msgspec.structs.replace(profile.gyro, accelerometers=sensors))
+    )
+    board = bench.gyro_board
+    azimuth, elevation = (axis.true_angle(0) for axis in bench.plant_stage.axes)
+    board.start_sampling(0)
+    board.read_samples(10)
+    expected = np.array([np.sin(elevation), 0.0, -np.cos(elevation)]) * 1e6 + [1e3, -2e3, 3e3]
+    np.testing.assert_allclose(board.specific_force(), expected, atol=1.0)

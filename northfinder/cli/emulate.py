@@ -7,11 +7,19 @@ import click
 from northfinder.errors import ConfigError
 from sim_device.can_bench import BITRATE
 from sim_device.can_server import BUSES
+from sim_device.instruments import GYROS, STAGES
 from sim_device.server import ServeOptions, parse_speed, serve
 
 
 @click.command("emulate")
-@click.option("--profile", default="tvg43", show_default=True, metavar="NAME|FILE", help="The emulated gyro and stage.")
+@click.option(
+    "--profile",
+    default="",
+    metavar="NAME|FILE",
+    help="Errors and noise of gyro and stage; the gyro's own if not given.",
+)
+@click.option("--gyro", type=click.Choice(sorted(GYROS)), default="native", show_default=True, help="Which instrument.")
+@click.option("--stage", type=click.Choice(sorted(STAGES)), default="native", show_default=True, help="Likewise.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random.")
 @click.option(
     "--azimuth",
@@ -55,6 +63,8 @@ from sim_device.server import ServeOptions, parse_speed, serve
 def command(
     *,
     profile: str,
+    gyro: str,
+    stage: str,
     seed: int,
     azimuth_deg: float,
     latitude_deg: float,
@@ -69,6 +79,7 @@ def command(
 
     \b
       northfinder emulate
+      northfinder emulate --gyro stim300 --stage zaber
       northfinder emulate --bus socketcand --speed max
       northfinder emulate --tcp --speed 10 --fault gyro:drop=1e-5 --fault stage:e-stop@120
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
@@ -76,6 +87,8 @@ def command(
         serve(
             ServeOptions(
                 profile=profile,
+                gyro=gyro,
+                stage=stage,
                 seed=seed,
                 azimuth_deg=azimuth_deg,
                 latitude_deg=latitude_deg,

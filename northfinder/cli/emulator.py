@@ -23,6 +23,8 @@ class SimulationOptions:
     profile: str
     seed: int
     speed: str
+    gyro: str = "native"  #: which instruments, see `sim_device.instruments`
+    stage: str = "native"
     bus: str = ""  #: "socketcand" or "slcan" for a CAN bus, serial lines if empty
 
 
@@ -35,6 +37,7 @@ class EmulatorProcess:
             [
                 sys.executable, "-m", "sim_device", "--parent-death",
                 "--azimuth", repr(options.azimuth_deg), "--latitude", repr(options.latitude_deg),
+                "--gyro", options.gyro, "--stage", options.stage,
                 "--profile", options.profile, "--seed", str(options.seed), "--speed", options.speed,
                 *(("--bus", options.bus) if options.bus else ()),
             ],

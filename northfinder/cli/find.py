@@ -67,7 +67,9 @@ STARTED = time.monotonic()
 @click.option("--quiet", is_flag=True, help="Show no progress.")
 @click.option("--sim-azimuth", type=float, default=33.0, show_default=True, metavar="DEG", help="The emulator's truth.")
 @click.option("--sim-latitude", type=click.FloatRange(-90, 90), default=50.429, show_default=True, metavar="DEG")
-@click.option("--sim-profile", default="tvg43", show_default=True, metavar="NAME|FILE", help="The emulated gyro.")
+@click.option("--sim-gyro", default="native", show_default=True, metavar="KIND", help="Which gyro is emulated.")
+@click.option("--sim-stage", default="native", show_default=True, metavar="KIND", help="Which stage is emulated.")
+@click.option("--sim-profile", metavar="NAME|FILE", help="The emulated gyro's errors and noise; its kind's own else.")
 @click.option("--seed", type=click.IntRange(min=0), help="Of the emulated noise; random if not given.")
 @click.option("--speed", default="1", show_default=True, metavar="X|max", help="Emulator's speed over real time.")
 @click.option("--bus", type=click.Choice(["socketcand", "slcan"]), help="Emulate a CAN bus instead of serial lines.")
@@ -85,8 +87,10 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
     options = Options(**given)
     # Whatever can be wrong with the command is found before an emulator is started or a port is opened.
     bench = options.bench()
-    config = bench or Config(gyro=GyroTable(address="", profile=options.sim_profile), stage=StageTable(address=""))
     truth = None if bench else options.truth()
+    config = bench or Config(
+        gyro=GyroTable(address="", profile=None if truth is None else truth.profile), stage=StageTable(address="")
+    )
     assumptions = options.assumptions(config)
     plan = make_plan(options.wishes(config.measurement), assumptions, settle=config.measurement.settle_s)
     clock = SystemClock()
@@ -131,7 +135,9 @@ class Options:
     quiet: bool
     sim_azimuth: float
     sim_latitude: float
-    sim_profile: str
+    sim_gyro: str
+    sim_stage: str
+    sim_profile: str | None
     seed: int | None
     speed: str
     bus: str | None
@@ -162,9 +168,11 @@ class Options:
         """Return the world to emulate; without a seed another one each time. Raises ConfigError."""
         _check_speed(self.speed)
         return SimulationOptions(
+            gyro=self.sim_gyro,
+            stage=self.sim_stage,
             azimuth_deg=self.sim_azimuth,
             latitude_deg=self.sim_latitude,
-            profile=self.sim_profile,
+            profile=self.sim_profile or _profile_of(self.sim_gyro),
             seed=secrets.randbits(32) if self.seed is None else self.seed,
             speed=self.speed,
             bus=self.bus or "",
@@ -211,6 +219,15 @@ def _check_speed(text: str) -> None:
         raise ConfigError(f"--speed: found {text!r}, expected a number of at least 1, or max")
 
 
+def _profile_of(gyro: str) -> str:
+    from sim_device.instruments import GYROS, instrument  # noqa: PLC0415  # not needed with devices
+
+    try:
+        return instrument(GYROS, "gyro", gyro).profile
+    except ValueError as error:
+        raise ConfigError(f"--sim-gyro: {error}") from None
+
+
 def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, as_json: bool) -> None:
     """Print the only result, or the summary of a campaign."""
     if len(results) == 1:
@@ -232,11 +249,15 @@ def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, a
 
 def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None) -> Gyro:
     """Open the gyro; connecting it then checks that the calibration is its own and still valid."""
-    return checked(_opened(open_gyro, table.address, clock, baudrate=table.baudrate), calibration, _today())
+    return checked(
+        _opened(open_gyro, table.address, clock, baudrate=table.baudrate, **table.options), calibration, _today()
+    )
 
 
 def _open_stage(table: StageTable, clock: Clock) -> Stage:
-    return _opened(open_stage, table.address, clock, baudrate=table.baudrate, limits=table.limits(), **table.options())
+    return _opened(
+        open_stage, table.address, clock, baudrate=table.baudrate, limits=table.limits(), **table.driver_options()
+    )
 
 
 def _today() -> date:

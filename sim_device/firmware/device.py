@@ -17,6 +17,8 @@ class Device:
         GYRO or STAGE.
     """
 
+    told_time_us = -1  # device time of the newest status that the host has to acknowledge
+
     def __init__(self, board: Board, kind: int) -> None:
         self._board = board
         self._session = Session(board, kind)

@@ -109,8 +109,8 @@ class StageDevice(Device):
             _FAULT: self._advance_fault,
         }
 
-    def poll(self, now_us: int) -> bytes:
-        """Do all that is due, in order of time, and return the bytes to send."""
+    def poll(self, now_us: int, _room: "int | None" = None) -> bytes:
+        """Do all that is due, in order of time, and return the bytes to send: none of them may be lost."""
         due = self._work_due_us()
         while due <= now_us:
             self._work(due)
