@@ -22,12 +22,18 @@ class BusPump:
     bus
         The bench's own end of the bus; the caller closes it.
 
+    Attributes
+    ----------
+    n_sent
+        Frames that the bench has sent.
+
     """
 
     def __init__(self, bench: CanBench, bus: can.BusABC) -> None:
         self._bench = bench
         self._bus = bus
         self._tap = bench.wire.tap()
+        self.n_sent = 0
 
     def step(self, now_us: int) -> None:
         """Bring the bench to `now_us`, in world time, with what has come over the bus."""
@@ -38,9 +44,14 @@ class BusPump:
         while waiting:
             time_us, identifier, data = waiting.popleft()
             self._bus.send(_message(time_us, identifier, data))
+            self.n_sent += 1
 
     def run(self, stop: threading.Event, speed: float = 1.0) -> None:
-        """Go with wall time, `speed` times as fast, until `stop` is set."""
+        """Go with wall time, `speed` times as fast, until `stop` is set.
+
+        It waits for no host: one that is away for long has missed its heartbeats. Tests of hosts that move the
+        stage use `step`.
+        """
         begin, origin_us = time.monotonic(), self._bench.now_us
         while not stop.is_set():
             message = self._bus.recv(_STEP_S)
