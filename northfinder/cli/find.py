@@ -249,15 +249,11 @@ def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, a
 
 def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None) -> Gyro:
     """Open the gyro; connecting it then checks that the calibration is its own and still valid."""
-    return checked(
-        _opened(open_gyro, table.address, clock, baudrate=table.baudrate, **table.options), calibration, _today()
-    )
+    return checked(_opened(open_gyro, table.address, clock, **table.driver_options()), calibration, _today())
 
 
 def _open_stage(table: StageTable, clock: Clock) -> Stage:
-    return _opened(
-        open_stage, table.address, clock, baudrate=table.baudrate, limits=table.limits(), **table.driver_options()
-    )
+    return _opened(open_stage, table.address, clock, limits=table.limits(), **table.driver_options())
 
 
 def _today() -> date:
