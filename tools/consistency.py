@@ -1,14 +1,15 @@
 """Compare errors with stated standard deviations over the globe, each run a whole ``find`` on the emulated bench.
 
-    python tools/consistency.py [--json] [--plan NAME] [--repeat N] [-- FIND-OPTION...]
+    python tools/consistency.py [--json] [--repeat N | --runs N] [-- FIND-OPTION...]
 
-Every azimuth of AZIMUTHS_DEG at every latitude of LATITUDES_DEG, each with a seed of its own, through pseudo-terminals
-and the whole protocol. The rms of error over stated standard deviation is 1 if the statement is honest.
+Every azimuth of AZIMUTHS_DEG at every latitude of LATITUDES_DEG, or with --runs so many azimuths around the horizon at
+these latitudes in turn, each with a seed of its own, through pseudo-terminals and the whole protocol. The rms of error over stated standard deviation is 1 if the statement is honest.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import subprocess
@@ -59,20 +60,24 @@ def find(azimuth_deg: float, latitude_deg: float, seed: int, options: list[str])
     )
 
 
-def all_runs(repeat: int, options: list[str]) -> Iterator[Run]:
-    """Run every azimuth at every latitude, `repeat` times, and show each."""
-    seed = 0
-    for _ in range(repeat):
-        for latitude in LATITUDES_DEG:
-            for azimuth in AZIMUTHS_DEG:
-                seed += 1
-                run = find(azimuth, latitude, seed, options)
-                print(
-                    f"azimuth {azimuth:5.1f} latitude {latitude:6.2f}: azimuth {run.azimuth_error_deg:+.3f} "
-                    f"(sd {run.azimuth_sd_deg:.3f}), latitude {run.latitude_error_deg} (sd {run.latitude_sd_deg})",
-                    file=sys.stderr,
-                )
-                yield run
+def places(repeat: int, n_runs: int | None) -> list[tuple[float, float]]:
+    """Return azimuth and latitude of each run, deg."""
+    if n_runs is None:
+        return [(azimuth, latitude) for latitude in LATITUDES_DEG for azimuth in AZIMUTHS_DEG] * repeat
+    azimuths = [360.0 * (number + 0.3) / n_runs for number in range(n_runs)]
+    return list(zip(azimuths, itertools.cycle(LATITUDES_DEG), strict=False))
+
+
+def all_runs(at: list[tuple[float, float]], options: list[str]) -> Iterator[Run]:
+    """Run once at each place, and show each."""
+    for seed, (azimuth, latitude) in enumerate(at, start=1):
+        run = find(azimuth, latitude, seed, options)
+        print(
+            f"azimuth {azimuth:5.1f} latitude {latitude:6.2f}: azimuth {run.azimuth_error_deg:+.3f} "
+            f"(sd {run.azimuth_sd_deg:.3f}), latitude {run.latitude_error_deg} (sd {run.latitude_sd_deg})",
+            file=sys.stderr,
+        )
+        yield run
 
 
 def rms(values: list[float]) -> float | None:
@@ -84,10 +89,11 @@ def main() -> None:
     """Run them all and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeat", type=int, default=1)
+    parser.add_argument("--runs", type=int, metavar="N", help="so many azimuths instead of the whole grid")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("options", nargs="*", help="handed to find, after --")
     arguments = parser.parse_args()
-    runs = list(all_runs(arguments.repeat, arguments.options))
+    runs = list(all_runs(places(arguments.repeat, arguments.runs), arguments.options))
     latitudes = [(run.latitude_error_deg, run.latitude_sd_deg) for run in runs]
     figures = {
         "n_runs": len(runs),
