@@ -584,6 +584,30 @@ def test_faults_at_rest() -> None:
     assert pressed.state == FAULT
 
 
+def test_an_axis_that_runs_away_at_rest() -> None:
+    """An axis found moving at rest is a RUNAWAY, not an encoder that has jumped."""
+    axis = Axis()
+    axis.ready()
+    for _ in range(200):
+        axis.board.axis[0] += 30 * DEG // 1000
+        axis.host.run(1000)
+    assert axis.emergencies == [RUNAWAY]
+    assert not axis.word & HOMED
+
+
+def test_no_set_point_is_taken_from_where_the_encoder_has_jumped_to() -> None:
+    """A set-point that comes right after an encoder's jump leads to the fault, not to a move."""
+    axis = Axis()
+    axis.ready()
+    axis.board.error[0] = DEG
+    axis.command(0x1F, 10 * DEG)
+    assert not axis.word & (BIT_12 | IN_MOTION)
+    axis.host.run(20_000)
+    assert axis.emergencies == [ENCODER]
+    assert axis.state == FAULT
+    assert axis.stays()
+
+
 def test_reset_node_resets_no_fault() -> None:
     """What has latched stays latched through NMT's resets."""
     axis = Axis()

@@ -275,7 +275,7 @@ class AxisNode(Node):
             self._obey(self.dictionary.get(0x604000), now_us)
             self._status_due_us = now_us
         self._follow_drive()
-        if self._offered and not self.drive.in_motion:
+        if self._offered and not (self.drive.in_motion or self.drive.suspected):
             self._take_set_point(now_us)
         report = (self._statusword(), self._mode())
         if report != self._reported or self._status_due_us <= now_us:

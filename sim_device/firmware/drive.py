@@ -47,6 +47,7 @@ class Drive:
         self.in_position = False
         self.motion_us = 0
         self.due_us = 0
+        self._suspected_us = -1  # since when the axis at rest is not where it rested
         self.limits = (board.azimuth_limits, board.elevation_limits)[index]  # about the reference edge
         self._board = board
         self._index = index
@@ -58,6 +59,11 @@ class Drive:
     def in_motion(self) -> bool:
         """Whether the axis is on its way, or slowing down."""
         return self.activity != REST
+
+    @property
+    def suspected(self) -> bool:
+        """Whether the axis at rest is not where it rested, and it is not known yet why."""
+        return self._suspected_us >= 0
 
     @property
     def velocity(self) -> int:
@@ -101,6 +107,7 @@ class Drive:
     def latch(self, fault: int, now_us: int) -> None:
         """Latch a fault, and come to rest."""
         self.fault = fault
+        self._suspected_us = -1
         self.in_position = False
         if fault in _LOSE_HOMING:
             self.homed = False
@@ -125,6 +132,8 @@ class Drive:
         """Supervise the axis at rest, before it is set in motion."""
         if not self.in_motion:
             self._check_rest(now_us)
+            if self.suspected:
+                self.due_us = min(self.due_us, now_us + self._board.control_period_us)
 
     def advance(self, now_us: int) -> None:
         """Do what is due at this control period."""
@@ -135,10 +144,12 @@ class Drive:
                 self._axis.drive(now_us)
         else:
             self._check_rest(now_us)
-        self.due_us = now_us + (self._board.control_period_us if self.in_motion else _REST_CHECK_US)
+        soon = self.in_motion or self.suspected
+        self.due_us = now_us + (self._board.control_period_us if soon else _REST_CHECK_US)
 
     def _set_out(self, activity: int, now_us: int) -> None:
         self.activity = activity
+        self._suspected_us = -1
         self.in_position = False
         self.motion_us = self.due_us = now_us
         self._axis.start(now_us)
@@ -153,8 +164,12 @@ class Drive:
         disturbed = self._axis.disturbed(now_us)
         if self._board.e_stop(now_us):
             self.latch(E_STOP, now_us)
-        elif self.homed and disturbed:
-            self.latch(ENCODER, now_us)
+        elif not (self.homed and disturbed):
+            self._suspected_us = -1
+        elif self._suspected_us < 0:
+            self._suspected_us = now_us  # a second look tells an axis that runs from an encoder that has jumped
+        elif now_us > self._suspected_us:
+            self.latch(RUNAWAY if self._axis.runs else ENCODER, now_us)
 
     def _supervise(self, now_us: int) -> None:
         axis = self._axis
