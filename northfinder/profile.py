@@ -35,13 +35,17 @@ class ErrorTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_onl
     tilt_sd_arcsec: float = 0.0  #: of the measured tilt, a constant error either way
     stage_angle_sd_arcsec: float = 0.0  #: of either stage angle at a position, the same at each visit
     misalignment_sd_arcsec: float = 0.0  #: of the input axis against the stage, either way
+    gyro_bias_sd_dph: float | None = None  #: of each gyro of a triad about zero, from turn-on to turn-on; None: unknown
+    accelerometer_bias_sd_mg: float | None = None  #: of each accelerometer about zero, likewise
 
     def __post_init__(self) -> None:
         """Check that every standard deviation can be one."""
         for name in self.__struct_fields__:
             value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
+            if value is not None and not 0.0 <= value < math.inf:
                 raise ValueError(f"{name} must be zero or positive, not {value}")
+        if self.gyro_bias_sd_dph == 0.0:
+            raise ValueError("gyro_bias_sd_dph must be positive, or left out where nothing is known of the biases")
 
 
 class GyroProfile(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):

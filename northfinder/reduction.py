@@ -46,6 +46,7 @@ class Reduction:
                     azimuth=span.measured_azimuth,
                     elevation=span.measured_elevation,
                     tilt=run.tilt,
+                    specific_force=_specific_force(run, samples_per_mean),
                     dwell=span.step,
                 )
             )
@@ -63,6 +64,7 @@ class _Run:
     first_index: int
     rate: NDArray[np.float64]
     tilt: tuple[float, float]
+    blocks: tuple[RateBlock, ...]
     fit: bool
 
 
@@ -84,7 +86,7 @@ def _cut(span: DwellSpan, run: list[RateBlock]) -> Iterator[_Run]:
     first, stop = max(span.first_index, begin), min(span.stop_index, _end(run[-1]))
     if first < stop:
         rate = np.concatenate([block.rate for block in run])[first - begin : stop - begin]
-        yield _Run(first, rate, _mean_tilt(run), _fit(run[0]))
+        yield _Run(first, rate, _mean_tilt(run), tuple(run), _fit(run[0]))
 
 
 def _end(block: RateBlock) -> int:
@@ -102,6 +104,26 @@ def _mean_tilt(run: list[RateBlock]) -> tuple[float, float]:
         return (0.0, 0.0)
     x, y = np.mean(tilts, axis=0)
     return (float(x), float(y))
+
+
+def _specific_force(run: _Run, samples_per_mean: int) -> NDArray[np.float64]:
+    """Return the mean specific force of each mean, from the blocks whose middle lies in it, shape (n, 3).
+
+    A mean without the middle of a block has that of the whole run; all are zero where nothing was measured.
+    """
+    n_means = -(-len(run.rate) // samples_per_mean)
+    measured = [block for block in run.blocks if block.specific_force is not None]
+    if not measured:
+        return np.zeros((n_means, 3))
+    length = np.array([len(block.counts) for block in measured])
+    middle = np.array([block.first_index for block in measured]) + length / 2.0
+    force = np.array([block.specific_force for block in measured]) * length[:, np.newaxis]
+    number = ((middle - run.first_index) // samples_per_mean).astype(np.int64)
+    inside = (number >= 0) & (number < n_means) & (middle < run.first_index + len(run.rate))
+    weight = np.bincount(number[inside], length[inside], n_means)
+    total = np.column_stack([np.bincount(number[inside], column[inside], n_means) for column in force.T])
+    whole = force.sum(axis=0) / length.sum()
+    return np.asarray(np.where(weight[:, np.newaxis] > 0.0, total / np.maximum(weight, 1.0)[:, np.newaxis], whole))
 
 
 def reduce_record(record: Record) -> Reduction:

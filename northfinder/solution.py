@@ -15,10 +15,11 @@ from northfinder.estimation.calibration import with_ratio
 from northfinder.estimation.disturbance import undisturbed
 from northfinder.estimation.geometry import wrapped
 from northfinder.estimation.least_squares import Weights
+from northfinder.estimation.levelling import Levelling, level
 from northfinder.estimation.propagation import gains
 from northfinder.profile import GyroProfile, NoiseTable, find_profile
 from northfinder.published import published_json
-from northfinder.units import ARCSEC, DPH
+from northfinder.units import ARCSEC, DPH, MILLI_G
 
 Method = Literal["generalised", "ordinary"]
 
@@ -33,6 +34,7 @@ class Assumptions:
     latitude_sd_deg: float = 0.0
     g_drift_dph: float | None = None  #: in place of any other acceleration-sensitive drift rate, deg/h per g
     calibration: Calibration | None = None  #: in place of the profile's constants
+    turn_sd_deg: float = 0.0  #: of a turn by hand
 
     @classmethod
     def gather(
@@ -44,6 +46,7 @@ class Assumptions:
         g_drift_dph: float | None,
         latitude_sd_deg: float = 0.0,
         calibration: Calibration | None = None,
+        turn_sd_deg: float = 0.0,
     ) -> Assumptions:
         """Look up the profile and check that all goes together. Raises ConfigError."""
         if g_drift_dph is not None and not math.isfinite(g_drift_dph):
@@ -57,6 +60,7 @@ class Assumptions:
             latitude_sd_deg=latitude_sd_deg,
             g_drift_dph=g_drift_dph,
             calibration=calibration,
+            turn_sd_deg=turn_sd_deg,
         )
 
     @property
@@ -78,7 +82,14 @@ class Assumptions:
             acceleration_sensitive_drift_rate=drift * DPH,
             acceleration_sensitive_drift_rate_sd=drift_sd * DPH,
             tilt_sd=profile.errors.tilt_sd_arcsec * ARCSEC,
+            bias_sd=None if profile.errors.gyro_bias_sd_dph is None else profile.errors.gyro_bias_sd_dph * DPH,
         )
+
+    @property
+    def accelerometer_bias_sd(self) -> float | None:
+        """How far each accelerometer's bias may be from zero, m/s^2; None if that is not known."""
+        bias_sd_mg = self._profile().errors.accelerometer_bias_sd_mg
+        return None if bias_sd_mg is None else bias_sd_mg * MILLI_G
 
     def declared(self) -> Declared:
         """Return what is known of errors that the estimator does not see."""
@@ -87,6 +98,7 @@ class Assumptions:
         drift = calibration is not None and ratio is None and self.g_drift_dph is None
         return Declared(
             stage_angle_sd=errors.stage_angle_sd_arcsec * ARCSEC,
+            turn_sd=math.radians(self.turn_sd_deg),
             misalignment_sd=errors.misalignment_sd_arcsec * ARCSEC,
             azimuth_offset=0.0 if azimuth is None else math.radians(azimuth.offset_deg),
             azimuth_offset_sd=None if azimuth is None else math.radians(azimuth.offset_sd_deg),
@@ -143,15 +155,29 @@ class Problem:
     drift: Literal["constant", "linear"]
     weights: Weights
     n_rejected: int
+    known: Known
+    declared: Declared
+    levelling: Levelling | None = None  #: None where tilt sensors, or nothing, tell the tilt
 
     @classmethod
     def of(cls, means: RateMeans, assumptions: Assumptions) -> Problem:
-        """With a noise model short means weighted by it; without one dwells that count alike and a bias that drifts."""
-        noise = assumptions.noise()
+        """With a noise model short means weighted by it; without one dwells that count alike and a bias that drifts.
+
+        Where accelerometers but no tilt sensors have measured, they tell the tilt.
+        """
+        noise, known, declared = assumptions.noise(), assumptions.known(), assumptions.declared()
+        levelling = None
+        if means.specific_force.any() and not means.tilt.any():
+            levelling = level(means, bias_sd=assumptions.accelerometer_bias_sd)
+            means = means.with_tilt(levelling.tilt)
+            known = replace(known, tilt_sd=math.hypot(known.tilt_sd, levelling.tilt_sd))
+            declared = replace(declared, azimuth_offset=declared.azimuth_offset - levelling.twist)
         if assumptions.method == "generalised" and noise is not None:
             keep = undisturbed(means)
-            return cls(means.select(keep), noise, "constant", "generalised", means.n - int(keep.sum()))
-        return cls(means.per_dwell(), noise, "linear" if noise is None else "constant", "ordinary", 0)
+            n_rejected = means.n - int(keep.sum())
+            return cls(means.select(keep), noise, "constant", "generalised", n_rejected, known, declared, levelling)
+        drift: Literal["constant", "linear"] = "linear" if noise is None else "constant"
+        return cls(means.per_dwell(), noise, drift, "ordinary", 0, known, declared, levelling)
 
     def estimate(self, known: Known) -> Fix:
         """Return the fix of the estimator alone."""
@@ -171,7 +197,8 @@ def solve(means: RateMeans, assumptions: Assumptions) -> Fix:
     With a noise model the short means are weighted by it; without one the dwells count alike, the bias may drift, and
     the standard deviations come from the residuals. Declared uncertainties are added to those of the estimate.
     """
-    problem, known, declared = Problem.of(means, assumptions), assumptions.known(), assumptions.declared()
+    problem = Problem.of(means, assumptions)
+    known, declared = problem.known, problem.declared
     fix = _planes_estimated(problem, known, declared)
     added = declared_variance(
         problem.means, fix, noise=problem.noise, known=known, drift=problem.drift, weights=problem.weights,
@@ -194,7 +221,7 @@ def _planes_estimated(problem: Problem, known: Known, declared: Declared) -> Fix
     """Return the estimator's fix, with the calibrated ratio of the two planes if there is one."""
     if declared.ratio == 1.0 and declared.ratio_sd == 0.0:
         return problem.estimate(known)
-    fix = problem.estimate(Known(tilt_sd=known.tilt_sd))
+    fix = problem.estimate(Known(tilt_sd=known.tilt_sd, bias_sd=known.bias_sd))
     if fix.latitude is None:  # no vertical plane was measured
         return problem.estimate(known)
     return with_ratio(fix, known, ratio=declared.ratio, ratio_sd=declared.ratio_sd)
@@ -204,11 +231,11 @@ def supplement(means: RateMeans, assumptions: Assumptions, fix: Fix) -> dict[str
     """Return what a report says beside the fix that `solve` gave: its budget, published formulas, the calibration."""
     problem = Problem.of(means, assumptions)
     budget = error_budget(
-        problem.means, fix, noise=problem.noise, known=assumptions.known(), drift=problem.drift,
-        weights=problem.weights, declared=assumptions.declared(),
+        problem.means, fix, noise=problem.noise, known=problem.known, drift=problem.drift,
+        weights=problem.weights, declared=problem.declared,
     )  # fmt: skip
-    published = published_json(means, problem.noise, fix)
-    said = {"budget": budget_to_json(budget), "notes": notes(assumptions, fix)}
+    published = published_json(means, problem.noise, fix) | levelling_to_json(problem.levelling)
+    said = {"budget": budget_to_json(budget), "notes": [*notes(assumptions, fix), *_level_notes(problem, assumptions)]}
     return said | published | calibration_to_json(assumptions)
 
 
@@ -220,6 +247,34 @@ def notes(assumptions: Assumptions, fix: Fix) -> list[str]:
     shift = abs(float(gains(fix, known, azimuth=fix.azimuth, vertical=True).rates[1, 2])) * DPH
     effect = f"each deg/h per g of it shifts the latitude by {math.degrees(shift):.2g} deg"
     return [f"the acceleration-sensitive drift rate is not known and taken as zero: {effect}"]
+
+
+def _level_notes(problem: Problem, assumptions: Assumptions) -> list[str]:
+    """Return in sentences what of the levelling the operator ought to know."""
+    if problem.levelling is None or problem.levelling.n_attitudes > 1 or assumptions.accelerometer_bias_sd is not None:
+        return []
+    by_milli_g = math.degrees(MILLI_G / problem.levelling.specific_force)
+    return [
+        f"the accelerometers' biases are not known and taken as zero: each mg of them is {by_milli_g:.2g} deg of tilt"
+    ]
+
+
+def levelling_to_json(levelling: Levelling | None) -> dict[str, Any]:
+    """Return the tilt that accelerometers have shown, nothing if it was not theirs to show; deg and mg."""
+    if levelling is None:
+        return {}
+    x, y = (math.degrees(angle) for angle in levelling.tilt)
+    bias, bias_sd = ([float(each) / MILLI_G for each in of] for of in (levelling.bias, levelling.bias_sd))
+    return {
+        "levelling": {
+            "tilt_x_deg": x,
+            "tilt_y_deg": y,
+            "tilt_sd_deg": math.degrees(levelling.tilt_sd),
+            "specific_force_m_s2": levelling.specific_force,
+            "accelerometer_bias_mg": bias,
+            "accelerometer_bias_sd_mg": bias_sd,
+        }
+    }
 
 
 def calibration_to_json(assumptions: Assumptions) -> dict[str, Any]:

@@ -8,5 +8,7 @@ import math
 DPH = math.radians(1.0) / 3600.0
 #: rad in one arc second.
 ARCSEC = math.radians(1.0) / 3600.0
+#: m/s^2 in one thousandth of standard gravity.
+MILLI_G = 9.80665e-3
 #: Rate of the earth's rotation about its axis, rad/s (15.041067 deg/h).
 EARTH_RATE = 7.292115e-5

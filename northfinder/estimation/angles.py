@@ -83,3 +83,16 @@ def horizontal_only(nev: Array, covariance: Array, known: Known) -> Angles:
     azimuth = math.atan2(east, north)
     value = np.array([azimuth, known.latitude or 0.0, scale_factor or 1.0])
     return Angles(value, full, known.latitude, scale_factor)
+
+
+def agreements(nev: Array, covariance: Array, known: Known, sd_dof: float) -> list[checks.Check]:
+    """Return whether the latitude and the scale factor that the data alone give agree with the known ones."""
+    alone = constrain(nev, covariance, Known())
+    found = []
+    if known.latitude is not None:
+        sd = math.hypot(alone.sd(1), known.latitude_sd)
+        found.append(checks.agreement("latitude", alone.value[1] - known.latitude, sd, "rad", sd_dof))
+    if known.scale_factor is not None:
+        sd = math.hypot(alone.sd(2), known.scale_factor_sd)
+        found.append(checks.agreement("scale factor", alone.value[2] - known.scale_factor, sd, "1", sd_dof))
+    return found

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from northfinder.estimation.fix import Fix, Known
 from northfinder.estimation.geometry import by_tilt
-from northfinder.estimation.least_squares import Weights, _assumed_vertical
+from northfinder.estimation.least_squares import Weights
 from northfinder.estimation.linear import Drift
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
@@ -39,6 +39,7 @@ class Declared:
     """Standard deviations that the data cannot show and that `Known` does not hold; zero where nothing is declared."""
 
     stage_angle_sd: float = 0.0  #: rad, of either stage angle at a position, the same at each visit
+    turn_sd: float = 0.0  #: rad, of the turn from one position to the next by hand, about the vertical
     misalignment_sd: float = 0.0  #: rad, of the input axis, either way
     azimuth_offset: float = 0.0  #: rad, calibrated, taken off the azimuth already
     azimuth_offset_sd: float | None = None  #: rad, None if it was not calibrated
@@ -128,7 +129,7 @@ def declared_variance(
 
     Parameters as for `error_budget`. The correlation of two known quantities may take something off.
     """
-    beside = (declared.stage_angle_sd, declared.misalignment_sd, declared.azimuth_offset_sd)
+    beside = (declared.stage_angle_sd, declared.turn_sd, declared.misalignment_sd, declared.azimuth_offset_sd)
     if not any(beside) and not declared.scale_drift_correlation:
         return np.zeros(2)
     path = Propagation.of(means, noise=noise, known=known, drift=drift, weights=weights)
@@ -194,8 +195,10 @@ def _known_lines(path: Propagation, fix: Fix, known: Known, gain: Gains, declare
     if declared.ratio_sd:
         by_ratio = gain.rates[:, 2] * fix.rates[2] / declared.ratio
         lines.append(_line("ratio of the scale factors", declared.ratio_sd, "1", "B", [declared.ratio_sd * by_ratio]))
+    if known.bias_sd is not None:
+        lines.append(_line("bias", known.bias_sd, "rad/s", "B", (known.bias_sd * gain.rates @ path.by_known_bias()).T))
     if not path.vertical:
-        sd = _assumed_vertical(known)[1]
+        sd = known.vertical_rate[1]
         lines.append(_line("vertical earth rate", sd, "rad/s", "B", [sd * gain.rates @ path.by_assumed_vertical()]))
     return lines
 
@@ -205,12 +208,15 @@ def _declared_lines(path: Propagation, fix: Fix, known: Known, gain: Gains, decl
     rates = fix.rates + np.array([0.0, 0.0, known.acceleration_sensitive_drift_rate])
     stage, misalignment = declared.stage_angle_sd, declared.misalignment_sd
     by_stage = stage * gain.rates @ path.by_stage_angles(rates) if stage else np.zeros((2, 0))
+    each = declared.turn_sd / math.sqrt(2.0)  # of the two positions of a turn
+    by_turn = each * gain.rates @ path.by_stage_angles(rates, ("azimuth",)) if each else np.zeros((2, 0))
     by_misalignment = misalignment * gain.rates @ path.by_misalignment(rates) if misalignment else np.zeros((2, 0))
     offset_sd = declared.azimuth_offset_sd
     if offset_sd is not None:  # the offset holds what a misalignment does to the azimuth
         by_misalignment = by_misalignment * np.array([[0.0], [1.0]])
     return [
         _line("stage angle", stage, "rad", "B", by_stage.T),
+        *([_line("turn by hand", declared.turn_sd, "rad", "B", by_turn.T)] if each else []),
         _line("input axis misalignment", misalignment, "rad", "B", by_misalignment.T),
         _line("azimuth offset", offset_sd or 0.0, "rad", "B", [np.array([offset_sd or 0.0, 0.0])]),
     ]

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from northfinder.errors import EstimateError
-from northfinder.estimation.angles import constrain
+from northfinder.estimation.angles import agreements, constrain
 from northfinder.estimation.campaign import circular_mean, deviations
 from northfinder.estimation.fix import Fix, Known
 from northfinder.estimation.geometry import wrapped
-from northfinder.estimation.least_squares import RESCALE_BELOW, _agreements
+from northfinder.estimation.least_squares import RESCALE_BELOW
 from northfinder.estimation.quantiles import chi_square, chi_square_tail
 from northfinder.units import EARTH_RATE
 
@@ -222,5 +222,5 @@ def with_ratio(fix: Fix, known: Known, *, ratio: float, ratio_sd: float) -> Fix:
         scale_factor_sd=found.sd(2),
         rates=rates,
         rates_covariance=cov,
-        checks=(*fix.checks, *_agreements(rates, cov, known, fix.sd_dof)),
+        checks=(*fix.checks, *agreements(rates, cov, known, fix.sd_dof)),
     )

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 
 from northfinder.estimation.checks import Check
 from northfinder.estimation.quantiles import student_t
+from northfinder.units import EARTH_RATE
 
 Array = NDArray[np.float64]
+
+#: The scale factor is taken to lie this near 1 where it is not known and the earth's vertical rate must be assumed.
+_SCALE_FACTOR_SD = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +32,7 @@ class Known:
     acceleration_sensitive_drift_rate: float = 0.0  #: rad/s per g along the input axis
     acceleration_sensitive_drift_rate_sd: float = 0.0
     tilt_sd: float = 0.0  #: rad, constant error of the measured tilt, either axis
+    bias_sd: float | None = None  #: rad/s; each axis's bias is zero within it; None if nothing is known of them
 
     def __post_init__(self) -> None:
         """Check that every value can be one."""
@@ -41,6 +46,20 @@ class Known:
             raise ValueError(f"latitude must lie between -pi/2 and pi/2 rad, not {self.latitude}")
         if self.scale_factor is not None and self.scale_factor <= 0.0:
             raise ValueError(f"scale_factor must be positive, not {self.scale_factor}")
+
+    @property
+    def vertical_rate(self) -> tuple[float, float]:
+        """What may be assumed of V, rad/s, where it is not measured, and its standard deviation.
+
+        It matters only through the tilt.
+        """
+        if self.latitude is None:  # every direction of the earth's axis alike: V is uniform within the earth rate
+            return self.acceleration_sensitive_drift_rate, EARTH_RATE / math.sqrt(3.0)
+        scale = 1.0 if self.scale_factor is None else self.scale_factor
+        scale_sd = _SCALE_FACTOR_SD if self.scale_factor is None else self.scale_factor_sd
+        spread = (scale * math.cos(self.latitude) * self.latitude_sd, math.sin(self.latitude) * scale_sd)
+        sd = math.hypot(EARTH_RATE * spread[0], EARTH_RATE * spread[1], self.acceleration_sensitive_drift_rate_sd)
+        return scale * EARTH_RATE * math.sin(self.latitude) + self.acceleration_sensitive_drift_rate, sd
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -37,17 +37,17 @@ def sensitivity(azimuth: ArrayLike, elevation: ArrayLike, tilt: ArrayLike, *, n_
     (n, n_axes, 3) array
     """
     azimuth, elevation, tilt = (np.asarray(angle, dtype=np.float64) for angle in (azimuth, elevation, tilt))
-    axes = np.stack(_head_axes(azimuth, elevation)[:n_axes], axis=1)
+    axes = head_axes(azimuth, elevation)[:, :n_axes]
     lean = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
     return np.asarray(_turned(axes, lean) * _TO_NEV)
 
 
-def _head_axes(azimuth: Array, elevation: Array) -> list[Array]:
-    """Return the axes forward, right and down of the stage's head on a level pedestal, each (n, 3)."""
+def head_axes(azimuth: Array, elevation: Array) -> Array:
+    """Return the axes forward, right and down of the stage's head in pedestal axes, shape (n, 3 axes, 3)."""
     sin_a, cos_a, sin_e, cos_e = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
     forward = np.column_stack([cos_e * cos_a, cos_e * sin_a, -sin_e])
     right = np.column_stack([-sin_a, cos_a, np.zeros(azimuth.size)])
-    return [forward, right, np.cross(forward, right)]
+    return np.stack([forward, right, np.cross(forward, right)], axis=1)
 
 
 def _turned(axes: Array, rotation: Array) -> Array:

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from northfinder.errors import EstimateError
 from northfinder.estimation import checks
-from northfinder.estimation.angles import constrain, horizontal_only, require_horizontal
+from northfinder.estimation.angles import agreements, constrain, horizontal_only, require_horizontal
 from northfinder.estimation.fix import Fix, Known
 from northfinder.estimation.geometry import by_tilt, wrapped
 from northfinder.estimation.linear import (
     Design,
     Drift,
+    KnownBias,
     build_design,
     half_span,
     least_squares,
@@ -38,8 +39,6 @@ Weights = Literal["ordinary", "generalised"]
 RESCALE_BELOW = 0.02
 #: Positions whose elevations spread by this sine or more are there to measure the vertical earth rate.
 MEASURES_VERTICAL = 0.05
-#: The scale factor is taken to lie this near 1 where it is not known and the earth's vertical rate must be assumed.
-_SCALE_FACTOR_SD = 0.1
 _NO_VERTICAL = "no position turns the input axis up or down, so the vertical earth rate was not measured"
 #: Opposite and repeated positions are compared among so many dwells, the first ones: their covariance is dense.
 MAX_CLOSURES = 400
@@ -85,12 +84,14 @@ def estimate(
         The positions do not determine an azimuth, the horizontal earth rate is not distinguishable from zero, or
         without a noise model no residuals are left to judge the noise by.
     ValueError
-        Generalised weights without a noise model, or a noise model that is all zero.
+        Generalised weights or known biases without a noise model, or a noise model that is all zero.
     """
     if weights == "generalised" and noise is None:
         raise ValueError("generalised weights need a noise model")
-    design = build_design(means, drift)
-    fit, vertical = _fit_best(design, noise, weights, known)
+    if known.bias_sd is not None and noise is None:
+        raise ValueError("known biases need a noise model to be weighed against")
+    design = build_design(means, drift, bias_known=known.bias_sd is not None)
+    fit, vertical = fit_best(design, noise, weights, known)
     nev, cov = _earth_rates(fit, known)
     horizontal = require_horizontal(nev, cov)
     constrained = constrain(nev, cov, known) if vertical else horizontal_only(nev, cov, known)
@@ -132,20 +133,22 @@ class _Fit:
     tests: tuple[tuple[str, float, int], ...] = ()  # of the noise model: name, chi2 and dof of the residuals
 
 
-def _fit_best(design: Design, noise: NoiseModel | None, weights: Weights, known: Known) -> tuple[_Fit, bool]:
+def fit_best(design: Design, noise: NoiseModel | None, weights: Weights, known: Known) -> tuple[_Fit, bool]:
     """Return the fit, and whether V is measured: by design, or in spite of it better than it can be assumed."""
     if design.vertical >= MEASURES_VERTICAL:
-        return _fit(design, noise, weights, None), True
-    assumed = _assumed_vertical(known)
+        return _fit(design, noise, weights, None, known), True
+    assumed = known.vertical_rate
     rows, columns = design.matrix.shape
     if design.vertical > 0.0 and (noise is not None or rows > columns):
-        measured = _fit(design, noise, weights, None)
+        measured = _fit(design, noise, weights, None, known)
         if math.sqrt(measured.covariance[2, 2]) < assumed[1]:
             return measured, True
-    return _fit(design, noise, weights, assumed), False
+    return _fit(design, noise, weights, assumed, known), False
 
 
-def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: tuple[float, float] | None) -> _Fit:
+def _fit(
+    design: Design, noise: NoiseModel | None, weights: Weights, vertical: tuple[float, float] | None, known: Known
+) -> _Fit:
     """Solve the linear model; `vertical` is V and its sd where it is assumed, not measured."""
     rate = design.means.rate
     if noise is None:
@@ -157,19 +160,27 @@ def _fit(design: Design, noise: NoiseModel | None, weights: Weights, vertical: t
         variance = plain.chi2 / plain.dof
         cov = variance * plain.inverse @ plain.inverse.T + plain.assumed
         return _Fit(plain.coefficients, cov, plain.chi2, plain.dof, float(plain.dof), 1.0)
-    best = least_squares(*design.whitened(noise, rate), vertical)
+    best = least_squares(*design.whitened(noise, rate), vertical, known_bias(design, known))
     tests = [("residuals", best.chi2, best.dof)]
     if (dwells := per_dwell(design)) is not None:
-        slow = least_squares(*dwells.whitened(noise, dwells.means.rate), vertical)
+        slow = least_squares(*dwells.whitened(noise, dwells.means.rate), vertical, known_bias(dwells, known))
         tests.append(("residuals between dwells", slow.chi2, slow.dof))
     if weights == "generalised":
         chosen, cov = best, best.inverse @ best.inverse.T
     else:
-        chosen = least_squares(design.matrix, rate.T.ravel(), vertical)
+        chosen = least_squares(design.matrix, rate.T.ravel(), vertical, known_bias(design, known, noise))
         cov = _propagate(chosen.inverse, noise.covariance(design.means))
     factor, sd_dof = max((_birge(chi2, dof) for _, chi2, dof in tests), key=lambda ratio: ratio[0])
     cov = factor**2 * cov + chosen.assumed
     return _Fit(chosen.coefficients, cov, best.chi2, best.dof, sd_dof, factor, tuple(tests))
+
+
+def known_bias(design: Design, known: Known, noise: NoiseModel | None = None) -> KnownBias | None:
+    """Return what is known of the biases, for rows that are whitened, or else have the variance of `noise`."""
+    if known.bias_sd is None:
+        return None
+    row_sd = 1.0 if noise is None else math.sqrt(float(np.mean(np.diag(noise.covariance(design.means)))))
+    return KnownBias(design.mean_biases, known.bias_sd, row_sd)
 
 
 def _propagate(inverse: Array, covariance: Array) -> Array:
@@ -186,17 +197,6 @@ def _birge(chi2: float, dof: int) -> tuple[float, float]:
     return math.sqrt(chi2 / dof), float(dof)
 
 
-def _assumed_vertical(known: Known) -> tuple[float, float]:
-    """Return what may be assumed of V where it is not measured, and its sd; it matters only through the tilt."""
-    if known.latitude is None:  # every direction of the earth's axis alike: V is uniform within the earth rate
-        return known.acceleration_sensitive_drift_rate, EARTH_RATE / math.sqrt(3.0)
-    scale = 1.0 if known.scale_factor is None else known.scale_factor
-    scale_sd = _SCALE_FACTOR_SD if known.scale_factor is None else known.scale_factor_sd
-    spread = (scale * math.cos(known.latitude) * known.latitude_sd, math.sin(known.latitude) * scale_sd)
-    sd = math.hypot(EARTH_RATE * spread[0], EARTH_RATE * spread[1], known.acceleration_sensitive_drift_rate_sd)
-    return scale * EARTH_RATE * math.sin(known.latitude) + known.acceleration_sensitive_drift_rate, sd
-
-
 def _earth_rates(fit: _Fit, known: Known) -> tuple[Array, Array]:
     """Return N, E, V and their covariance, with the acceleration-sensitive drift and the tilt's error allowed for."""
     nev = fit.coefficients[:3] - np.array([0.0, 0.0, known.acceleration_sensitive_drift_rate])
@@ -211,9 +211,9 @@ def _bias_terms(
     design: Design, fit: _Fit
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Return mean bias, its sd, slope and its sd of each axis; no slope unless the drift is linear."""
-    n_axes, n_bias = design.means.n_axes, design.bias.shape[1]
+    n_bias = design.bias.shape[1]
     coefficients, cov = fit.coefficients[3:], fit.covariance[3:, 3:]
-    level = np.kron(np.eye(n_axes), design.bias.mean(axis=0))
+    level = design.mean_biases[:, 3:]
     bias, bias_sd = level @ coefficients, np.sqrt(np.diag(level @ cov @ level.T))
     if design.drift != "linear":
         return tuple(bias.tolist()), tuple(bias_sd.tolist()), (), ()
@@ -244,7 +244,7 @@ def _checks(
     found = checks.closures(dwells, dwell_cov, fit.sd_dof if noise is None else math.inf)
     found += [checks.residuals(name, chi2, dof) for name, chi2, dof in fit.tests if dof]
     if vertical and known != _UNKNOWN:
-        found += _agreements(nev, covariance, known, fit.sd_dof)
+        found += agreements(nev, covariance, known, fit.sd_dof)
     if not vertical:
         found += _horizontal_agreement(nev, covariance, known, fit.sd_dof)
     return found
@@ -261,16 +261,3 @@ def _horizontal_agreement(nev: Array, covariance: Array, known: Known, sd_dof: f
     measured_sd = math.sqrt(max(float(direction @ covariance[:2, :2] @ direction), 0.0))
     sd = math.hypot(measured_sd, per_scale * known.scale_factor_sd, per_latitude * known.latitude_sd)
     return [checks.agreement("earth rate", horizontal - known.scale_factor * per_scale, sd, "rad/s", sd_dof)]
-
-
-def _agreements(nev: Array, covariance: Array, known: Known, sd_dof: float) -> list[checks.Check]:
-    """Return whether the latitude and the scale factor that the data alone give agree with the known ones."""
-    alone = constrain(nev, covariance, _UNKNOWN)
-    found = []
-    if known.latitude is not None:
-        sd = math.hypot(alone.sd(1), known.latitude_sd)
-        found.append(checks.agreement("latitude", alone.value[1] - known.latitude, sd, "rad", sd_dof))
-    if known.scale_factor is not None:
-        sd = math.hypot(alone.sd(2), known.scale_factor_sd)
-        found.append(checks.agreement("scale factor", alone.value[2] - known.scale_factor, sd, "1", sd_dof))
-    return found

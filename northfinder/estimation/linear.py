@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,12 +38,18 @@ class Design:
     sensitivity: Array  #: (n, n_axes, 3)
     bias: Array  #: (n, n_bias), the same for each axis
     drift: Drift
+    bias_known: bool  #: whether the biases are zero within a standard deviation, and need not be measured
     vertical: float  #: part of the column of V that the other columns leave: a sine of elevation
 
     @property
     def matrix(self) -> Array:
         """The design, shape (n_axes n, 3 + n_axes n_bias)."""
         return _stack(self.sensitivity, self.bias)
+
+    @property
+    def mean_biases(self) -> Array:
+        """What takes the coefficients to the mean bias of each axis, shape (n_axes, 3 + n_axes n_bias)."""
+        return _mean_biases(self.means.n_axes, self.bias)
 
     def whitened(self, noise: NoiseModel, rate: Array) -> tuple[Array, Array]:
         """Return design and rates, (n, n_axes), with the covariance of the noise taken out of the rows."""
@@ -58,10 +65,15 @@ def _stack(h: Array, bias: Array) -> Array:
     return np.hstack([h.swapaxes(0, 1).reshape(-1, 3), np.kron(np.eye(h.shape[1]), bias)])
 
 
-def build_design(means: RateMeans, drift: Drift) -> Design:
+def _mean_biases(n_axes: int, bias: Array) -> Array:
+    return np.hstack([np.zeros((n_axes, 3)), np.kron(np.eye(n_axes), bias.mean(axis=0))])
+
+
+def build_design(means: RateMeans, drift: Drift, *, bias_known: bool = False) -> Design:
     """Return the design for `means`. Raises EstimateError naming what these positions cannot determine, but for V.
 
-    The slope of a linear drift is taken about the middle of the data, and over half their span.
+    The slope of a linear drift is taken about the middle of the data, and over half their span. A known bias is as
+    good as rows that measure it.
     """
     if drift == "pairs":
         pair = np.unique(means.dwell, return_inverse=True)[1] // 2
@@ -71,16 +83,19 @@ def build_design(means: RateMeans, drift: Drift) -> Design:
     else:
         bias = np.ones((means.n, 1))
     h = sensitivity(means.azimuth, means.elevation, means.tilt, n_axes=means.n_axes)
-    return Design(means, h, bias, drift, vertical=_check_determined(_stack(h, bias)))
+    rows = _stack(h, bias)
+    if bias_known:
+        rows = np.vstack([rows, math.sqrt(means.n) * _mean_biases(means.n_axes, bias)])
+    return Design(means, h, bias, drift, bias_known, vertical=_check_determined(rows))
 
 
 def per_dwell(design: Design) -> Design | None:
     """Return the design of the dwell means of `design`; None if they are the same, or too few to leave a residual."""
     means = design.means.per_dwell()
-    unknowns = 3 + means.n_axes * design.bias.shape[1]
+    unknowns = 3 + means.n_axes * (design.bias.shape[1] - design.bias_known)
     if means.n == design.means.n or means.n * means.n_axes <= unknowns:
         return None
-    return build_design(means, design.drift)
+    return build_design(means, design.drift, bias_known=design.bias_known)
 
 
 def reduced_time(means: RateMeans) -> Array:
@@ -125,24 +140,45 @@ class LinearFit:
     """Least squares of one design: coefficients, what maps the rows to them, and the sum of squared residuals."""
 
     coefficients: Array  #: (p,)
-    inverse: Array  #: (p, rows), maps the rows to the coefficients
-    assumed: Array  #: (p, p), covariance that the assumed V brings; zero where V is measured
+    inverse: Array  #: (p, rows), maps the rows of the data to the coefficients
+    by_vertical: Array  #: (p,), what the assumed V does to the coefficients; zero where V is measured
+    by_bias: Array  #: (p, n_axes), what the known bias of each axis does to them; no columns where none is known
+    assumed: Array  #: (p, p), covariance that the assumed V and the known biases bring
     chi2: float
     dof: int
 
 
-def least_squares(matrix: Array, rate: Array, vertical: tuple[float, float] | None) -> LinearFit:
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownBias:
+    """Rows that say that each axis's mean bias is zero, and how much one counts against a row of data."""
+
+    rows: Array  #: (n_axes, p)
+    sd: float  #: rad/s
+    row_sd: float  #: of a row of data, in its unit
+
+
+def least_squares(
+    matrix: Array, rate: Array, vertical: tuple[float, float] | None, bias: KnownBias | None = None
+) -> LinearFit:
     """Solve ``matrix x = rate``; `vertical` is V and its standard deviation where it is assumed, not measured."""
-    free = np.arange(matrix.shape[1]) != (-1 if vertical is None else 2)
+    n, p = matrix.shape
+    if bias is not None:
+        weight = bias.row_sd / bias.sd
+        matrix, rate = np.vstack([matrix, weight * bias.rows]), np.append(rate, np.zeros(len(bias.rows)))
+    free = np.arange(p) != (-1 if vertical is None else 2)
     q, r = linalg.qr(matrix[:, free], mode="economic")
     inverse = np.zeros(matrix.T.shape)
     inverse[free] = linalg.inv(r) @ q.T
     value, sd = vertical or (0.0, 0.0)
-    by_vertical = np.zeros(matrix.shape[1])
+    by_vertical = np.zeros(p)
     if vertical is not None:
         by_vertical = -inverse @ matrix[:, 2]
         by_vertical[2] = 1.0
     coefficients = inverse @ rate + value * by_vertical
     residual = rate - matrix @ coefficients
+    by_bias = inverse[:, n:] if bias is None else weight * inverse[:, n:]
+    assumed = sd**2 * np.outer(by_vertical, by_vertical)
+    if bias is not None:
+        assumed += bias.sd**2 * by_bias @ by_bias.T
     dof = matrix.shape[0] - int(free.sum())
-    return LinearFit(coefficients, inverse, sd**2 * np.outer(by_vertical, by_vertical), float(residual @ residual), dof)
+    return LinearFit(coefficients, inverse[:, :n], by_vertical, by_bias, assumed, float(residual @ residual), dof)

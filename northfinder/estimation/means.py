@@ -31,6 +31,8 @@ class RateMeans:
         Measured stage angles, rad.
     tilt : (n, 2) array
         Measured tilt of the pedestal, rad; zero if not given.
+    specific_force : (n, 3) array
+        Along the axes of a triad, m/s^2, an upward axis reading +g; zero if not given.
     dwell : (n,) int array
         Which dwell a mean belongs to, never decreasing; numbered 0, 1, ... if not given.
     n_samples : (n,) int array
@@ -50,6 +52,7 @@ class RateMeans:
     azimuth: Array
     elevation: Array
     tilt: Array
+    specific_force: Array
     dwell: NDArray[np.int64]
     n_samples: NDArray[np.int64]
 
@@ -62,6 +65,7 @@ class RateMeans:
         azimuth: ArrayLike,
         elevation: ArrayLike,
         tilt: ArrayLike | None = None,
+        specific_force: ArrayLike | None = None,
         dwell: ArrayLike | None = None,
         n_samples: ArrayLike | None = None,
     ) -> None:
@@ -71,7 +75,9 @@ class RateMeans:
         if self.rate.ndim == 1:
             object.__setattr__(self, "rate", self.rate[:, np.newaxis])
         n = self.start.size
-        object.__setattr__(self, "tilt", np.zeros((n, 2)) if tilt is None else np.array(tilt, dtype=np.float64))
+        for name, beside, width in (("tilt", tilt, 2), ("specific_force", specific_force, 3)):
+            given_or_zero = np.zeros((n, width)) if beside is None else np.array(beside, dtype=np.float64)
+            object.__setattr__(self, name, given_or_zero)
         whole = {"dwell": np.arange(n) if dwell is None else dwell}
         whole["n_samples"] = np.ones(n, dtype=np.int64) if n_samples is None else n_samples
         for name, value in whole.items():
@@ -82,7 +88,8 @@ class RateMeans:
         n = self.start.size
         for field in fields(self):
             array = getattr(self, field.name)
-            expected = {"rate": (n, self.rate.shape[-1]), "tilt": (n, 2)}.get(field.name, (n,))
+            widths = {"rate": self.rate.shape[-1], "tilt": 2, "specific_force": 3}
+            expected = (n, widths[field.name]) if field.name in widths else (n,)
             if array.shape != expected:
                 raise ValueError(f"{field.name} has shape {array.shape}, expected {expected}")
             if not np.all(np.isfinite(array)):
@@ -124,7 +131,14 @@ class RateMeans:
 
     def with_rate(self, rate: ArrayLike) -> RateMeans:
         """Return means over the same intervals at the same attitudes with other rates."""
-        return RateMeans(**{field.name: getattr(self, field.name) for field in fields(self)} | {"rate": rate})
+        return self._changed(rate=rate)
+
+    def with_tilt(self, tilt: tuple[float, float]) -> RateMeans:
+        """Return the same means on a pedestal with that tilt, rad."""
+        return self._changed(tilt=np.tile(tilt, (self.n, 1)))
+
+    def _changed(self, **changes: ArrayLike) -> RateMeans:
+        return RateMeans(**{field.name: getattr(self, field.name) for field in fields(self)} | changes)
 
     def per_dwell(self) -> RateMeans:
         """Return the mean over each unbroken run within a dwell: one a dwell, more where data are missing inside it."""
@@ -136,7 +150,8 @@ class RateMeans:
             weight = self.duration.reshape(-1, *[1] * (values.ndim - 1))
             return np.add.reduceat(values * weight, first) / total.reshape(-1, *[1] * (values.ndim - 1))
 
-        averaged = {name: mean(getattr(self, name)) for name in ("rate", "azimuth", "elevation", "tilt")}
+        names = ("rate", "azimuth", "elevation", "tilt", "specific_force")
+        averaged = {name: mean(getattr(self, name)) for name in names}
         n_samples = np.add.reduceat(self.n_samples, first)
         return RateMeans(
             start=self.start[first], duration=total, dwell=self.dwell[first], n_samples=n_samples, **averaged
@@ -161,6 +176,7 @@ def from_samples(
     azimuth: float,
     elevation: float,
     tilt: tuple[float, float] = (0.0, 0.0),
+    specific_force: ArrayLike = (0.0, 0.0, 0.0),
     dwell: int = 0,
 ) -> RateMeans:
     """Average one unbroken run of samples at one attitude into means of `samples_per_mean`, the last one shorter.
@@ -173,8 +189,8 @@ def from_samples(
         Index of the first sample; the start of a sample is its index over `sample_rate` (1/s).
     samples_per_mean : int
         Samples in a mean; a remainder at the end becomes a shorter mean.
-    azimuth, elevation, tilt, dwell
-        Of the whole run, as in `RateMeans`.
+    azimuth, elevation, tilt, specific_force, dwell
+        Of the whole run, as in `RateMeans`; the specific force of each mean where it has that shape.
 
     Returns
     -------
@@ -194,6 +210,7 @@ def from_samples(
         azimuth=np.full(n, azimuth),
         elevation=np.full(n, elevation),
         tilt=np.tile(tilt, (n, 1)),
+        specific_force=np.broadcast_to(specific_force, (n, 3)),
         dwell=np.full(n, dwell),
         n_samples=n_samples,
     )

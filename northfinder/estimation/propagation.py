@@ -5,6 +5,7 @@ The weights are those that `estimate` used, so what is propagated here adds up t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from northfinder.estimation.checks import SAME_POSITION
 from northfinder.estimation.fix import Fix, Known
 from northfinder.estimation.geometry import rates_jacobian, sensitivity
-from northfinder.estimation.least_squares import MEASURES_VERTICAL, Weights, _fit_best
+from northfinder.estimation.least_squares import MEASURES_VERTICAL, Weights, fit_best, known_bias
 from northfinder.estimation.linear import Design, Drift, LinearFit, build_design, least_squares
 from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
@@ -77,6 +78,7 @@ class Propagation:
     fit: LinearFit
     noise: NoiseModel | None
     weights: Weights
+    known: Known
     vertical: bool  #: whether V was measured, not assumed
 
     @classmethod
@@ -88,13 +90,12 @@ class Propagation:
         Raises EstimateError as it does.
         """
         means = _at_most(means, MANY)
-        design = build_design(means, drift)
+        design = build_design(means, drift, bias_known=known.bias_sd is not None)
         vertical = design.vertical >= MEASURES_VERTICAL
         if 0.0 < design.vertical < MEASURES_VERTICAL:
-            _, vertical = _fit_best(design, noise, weights, known)
-        return cls(
-            design, _solved(design, noise if weights == "generalised" else None, vertical), noise, weights, vertical
-        )
+            _, vertical = fit_best(design, noise, weights, known)
+        fit = _solved(design, noise, weights, known, vertical)
+        return cls(design, fit, noise, weights, known, vertical)
 
     def through(self, columns: Array) -> Array:
         """Return what errors of the mean rates, (n, n_axes, m), make of N, E and V, shape (3, m)."""
@@ -123,8 +124,8 @@ class Propagation:
             ends = []
             for step in (_STEP, -_STEP):
                 changed = replace(self.noise, **{kind: coefficient * (1.0 + step) ** 0.5})
-                inverse = _solved(self.design, changed, self.vertical).inverse[:3]
-                ends.append(inverse @ inverse.T)
+                solved = _solved(self.design, changed, self.weights, self.known, self.vertical)
+                ends.append((solved.inverse @ solved.inverse.T + solved.assumed)[:3, :3])
             return np.asarray((ends[0] - ends[1]) / (2.0 * _STEP))
         alone = NoiseModel(**{kind: coefficient}).covariance(self.design.means)
         n = len(alone)
@@ -133,16 +134,19 @@ class Propagation:
 
     def without_drift(self) -> Array:
         """Return ``(A^T A)^-1`` of N, E and V, shape (3, 3), for a bias that does not drift, ordinary weights."""
-        inverse = _solved(build_design(self.design.means, "constant"), None, self.vertical).inverse[:3]
+        design = build_design(self.design.means, "constant")
+        inverse = _solved(design, None, "ordinary", Known(), self.vertical).inverse[:3]
         return np.asarray(inverse @ inverse.T)
 
     def by_assumed_vertical(self) -> Array:
         """Return the derivative of N, E and V by the V that is assumed where it is not measured, shape (3,)."""
-        noise = self.noise if self.weights == "generalised" else None
-        outer = least_squares(*_rows(self.design, noise), (0.0, 1.0)).assumed
-        return np.asarray(outer[:3, 2])
+        return self.fit.by_vertical[:3]
 
-    def by_stage_angles(self, rates: Array) -> Array:
+    def by_known_bias(self) -> Array:
+        """Return the derivative of N, E and V by the known bias of each axis, shape (3, n_axes)."""
+        return self.fit.by_bias[:3]
+
+    def by_stage_angles(self, rates: Array, of: Sequence[str] = ("azimuth", "elevation")) -> Array:
         """Return what one radian of error of each stage angle at each position makes of N, E and V, shape (3, m).
 
         The error of a stage belongs to the position: it is the same at each visit.
@@ -150,7 +154,7 @@ class Propagation:
         means = self.design.means
         position = _positions(self.design.sensitivity.reshape(means.n, -1))
         columns = []
-        for angle in ("azimuth", "elevation"):
+        for angle in of:
             ends = []
             for step in (_ANGLE_STEP, -_ANGLE_STEP):
                 angles = {"azimuth": means.azimuth, "elevation": means.elevation}
@@ -176,14 +180,18 @@ class Propagation:
         return self.through(np.stack(columns, axis=2))
 
 
-def _rows(design: Design, noise: NoiseModel | None) -> tuple[Array, Array]:
-    """Return design and rates, whitened if there is a noise."""
-    rate = design.means.rate
-    return (design.matrix, rate.T.ravel()) if noise is None else design.whitened(noise, rate)
-
-
-def _solved(design: Design, noise: NoiseModel | None, vertical: bool) -> LinearFit:  # noqa: FBT001  # private
-    return least_squares(*_rows(design, noise), None if vertical else (0.0, 0.0))
+def _solved(
+    design: Design,
+    noise: NoiseModel | None,
+    weights: Weights,
+    known: Known,
+    vertical: bool,  # noqa: FBT001  # private
+) -> LinearFit:
+    assumed = None if vertical else (0.0, 0.0)
+    if noise is None or weights == "ordinary":
+        rows = (design.matrix, design.means.rate.T.ravel())
+        return least_squares(*rows, assumed, known_bias(design, known, noise))
+    return least_squares(*design.whitened(noise, design.means.rate), assumed, known_bias(design, known))
 
 
 def _at_most(means: RateMeans, n: int) -> RateMeans:
