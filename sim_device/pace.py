@@ -6,7 +6,8 @@ must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. Where hosts acknow
 not read what was sent, and for a stage that is polled, the last poll counts. So a run at full speed is a lockstep with
 the host. When the host stays away, time goes on at 1x from there, and a dead host trips the stage's watchdog as in
 reality: after a quarter of a second with the stage at rest, where a lost frame may be all there is to it; after a
-second while it moves, so that a host which is merely busy finds the same world again.
+second while it moves, so that a host which is merely busy finds the same world again. At N times real time what was
+waited for a host is made up for, up to a second of it, so that N is what a whole run has if its host is fast enough.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ REST_PATIENCE_US = 250_000  #: the same with the stage at rest
 MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
 UNREAD_LOOK_US = 200  #: between looks at whether the host has read what it need not acknowledge
+CATCH_UP_US = 1_000_000  #: of wall time, the most that is made up for
 CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
 
 
@@ -49,7 +51,8 @@ class Pace:
         """Let the world follow wall time at 1x, or without hosts at the speed asked for."""
         bench = self._bench
         passed_us, self._wall_us = wall_us - self._wall_us, wall_us
-        self._limit_us = bench.now_us + self._speed * passed_us
+        behind_us = min(max(0.0, self._limit_us - bench.now_us), self._speed * CATCH_UP_US)
+        self._limit_us = math.inf if self._speed == math.inf else bench.now_us + behind_us + self._speed * passed_us
         if self._in_motion != self._moves():
             self._in_motion = not self._in_motion
             self._lead_us = bench.now_us - (wall_us - passed_us)
@@ -72,7 +75,7 @@ class Pace:
         """Return for how long, in wall time, nothing will happen unless a host says something."""
         due = self._next_us()
         if due is not None:
-            return (due - self._bench.now_us) / self._speed
+            return max(0.0, due - self._limit_us) / self._speed
         if self._speed > 1 and any(line.unread for line in self._bench.lines):
             return UNREAD_LOOK_US  # nothing tells when a host has read
         next_due = self._bench.next_due_us()

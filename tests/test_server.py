@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from raw_host import (
     SELF_TEST,
     STAGE_STATUS,
     STREAM_START,
+    Decoder,
     RawPort,
     Samples,
     heartbeat,
@@ -334,3 +336,25 @@ def test_pace_with_a_host_that_dies() -> None:
     pace.advance(REST_PATIENCE_US + 5_000_000)
     assert bench.now_us == ahead + 5_000_000
     assert not pace.run_ahead()
+
+
+@pytest.mark.parametrize("away_us", [0, 3_000_000])
+def test_pace_makes_up_for_waiting(away_us: int) -> None:
+    """At 10x a minute takes 6 s though the host needs 5 ms a block; of a long absence a second is made up for."""
+    bench, pending = SimBench("ideal"), deque[tuple[int, int]]()
+    pace, decoder = Pace(bench, 10.0), Decoder()
+    bench.gyro.feed(hello(), 0)
+    bench.gyro.feed(request(STREAM_START, 1), 0)
+    back_us = 2_000_000 + away_us
+    for wall_us in range(0, back_us + 4_000_000, 1000):
+        pace.advance(wall_us)
+        while pending and pending[0][0] <= wall_us and not 2_000_000 <= wall_us < back_us:
+            bench.gyro.feed(heartbeat(pending.popleft()[1]), bench.now_us)
+        ahead = True
+        while ahead:
+            said = decoder.feed(bench.gyro.poll(bench.now_us))
+            samples = [parse_samples(body) for body in said if body[0] == SAMPLES]
+            pending.extend((wall_us + 5000, block.time_us) for block in samples)
+            ahead = not said and pace.run_ahead()
+    made_up_us = 1_000_000 if away_us else 0
+    assert bench.now_us == pytest.approx(10 * (6_000_000 + made_up_us) + max(0, away_us - made_up_us), abs=1_000_000)
