@@ -3,7 +3,8 @@
     python tools/consistency.py [--json] [--repeat N | --runs N] [-- FIND-OPTION...]
 
 Every azimuth of AZIMUTHS_DEG at every latitude of LATITUDES_DEG, or with --runs so many azimuths around the horizon at
-these latitudes in turn, each with a seed of its own, through pseudo-terminals and the whole protocol. The rms of error over stated standard deviation is 1 if the statement is honest.
+these latitudes in turn, each with a seed of its own, through pseudo-terminals and the whole protocol. The rms of error
+over stated standard deviation is 1 if the statement is honest.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
-AZIMUTHS_DEG = (0, 33, 90, 147, 180, 225, 270, 359)
-LATITUDES_DEG = (-65, -33, 0.5, 20, 50.429, 75)
+AZIMUTHS_DEG = (0.0, 33.0, 90.0, 147.0, 180.0, 225.0, 270.0, 359.0)
+LATITUDES_DEG = (-65.0, -33.0, 0.5, 20.0, 50.429, 75.0)
 
 
 @dataclass(frozen=True, slots=True)
