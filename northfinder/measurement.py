@@ -10,11 +10,12 @@ from typing import Any, Protocol
 from drivers.api import Clock, Gyro, RateBlock, Stage
 from northfinder.errors import EstimateError
 from northfinder.estimation import Fix
-from northfinder.record import DwellSpan
+from northfinder.record import DwellSpan, Record
 from northfinder.recorder import Recorder
-from northfinder.reduction import Reduction
+from northfinder.reduction import Reduction, reduce_record
 from northfinder.sequencer import Plan, Progress, Sequencer
 from northfinder.solution import Assumptions, before_offset, fix_to_json, solve, supplement
+from northfinder.streams import Earlier, earlier_of
 
 
 class Watcher(Protocol):
@@ -35,6 +36,7 @@ class Measurement:
     assumptions: Assumptions
     record: Path
     meta: Mapping[str, object] = field(default_factory=dict)  #: kept in the record as it is
+    resume: bool = False  #: go on with a record that there is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,11 +77,12 @@ def measure(
     Raises what `Sequencer.run` raises, RecordError, and EstimateError if the data determine no azimuth. The record is
     closed in every case.
     """
-    with Recorder(measurement.record, utc) as recorder:
+    earlier, reduction = _before(measurement)
+    with Recorder(measurement.record, utc, clock=clock.now, resume=measurement.resume) as recorder:
         for key, value in measurement.meta.items():
             recorder.set_meta(key, value)
         recorder.set_meta("assumptions", measurement.assumptions)
-        observer = _Observer(watcher, measurement.assumptions)
+        observer = _Observer(watcher, measurement.assumptions, reduction)
         sequencer = Sequencer(
             open_gyro=measurement.open_gyro,
             open_stage=measurement.open_stage,
@@ -89,6 +92,8 @@ def measure(
             observer=observer,
             settle=measurement.settle,
             stop_requested=stop_requested,
+            earlier=earlier,
+            fix=observer.estimate() if earlier.spans else None,
         )
         sequencer.run()
         means = observer.reduction.means()
@@ -103,6 +108,14 @@ def measure(
         )
         recorder.add_fix(outcome.to_json())
     return outcome
+
+
+def _before(measurement: Measurement) -> tuple[Earlier, Reduction]:
+    """Return what the record of a measurement to be resumed holds, and its means; nothing for a new one."""
+    if not measurement.resume:
+        return Earlier(), Reduction()
+    with Record(measurement.record) as record:
+        return earlier_of(record), reduce_record(record)
 
 
 @dataclass(slots=True)
@@ -121,6 +134,10 @@ class _Observer:
     def on_dwell(self, span: DwellSpan, blocks: list[RateBlock]) -> Fix | None:
         """Reduce the dwell, and estimate as soon as that is possible: for the plan, where stage azimuth zero points."""
         self.reduction.add(span, blocks)
+        return self.estimate()
+
+    def estimate(self) -> Fix | None:
+        """Return the fix from the dwells so far, before the calibrated offset; None while there is none."""
         try:
             self.fix = solve(self.reduction.means(), self.assumptions)
         except EstimateError:

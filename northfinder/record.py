@@ -1,14 +1,8 @@
 """The record of a measurement: one SQLite file that holds everything that was measured, and what was made of it.
 
 Written in write-ahead mode, so that whatever was committed survives the death of the process; when the record is
-closed, one plain file remains. Times are in s, angles in rad, rates in rad/s per count; the schema below is version 1.
-
-    meta          key, value         configuration, identities, versions, as JSON
-    block         one row a block of samples, counts as little-endian int32 or float32, CRC-32C of the counts
-    stage_state   one row a reported state of the stage
-    step          one row a step of the plan: target, measured stage angles, first and stop index of its samples
-    event         what happened and when, by the host's clock
-    fix           what was estimated, as JSON
+closed, one plain file remains. `record_schema` is its layout, version 1, docs/record.md its description. Times are in
+s, angles in rad, rates in rad/s per count. Every row is checked against its seal before anything is made of it.
 """
 
 from __future__ import annotations
@@ -21,41 +15,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import fastcrc
 import msgspec
 import numpy as np
 
 from drivers.api import GyroStatus, RateBlock, StageMode, StageState
 from northfinder.errors import RecordError
-
-#: "NFR1" in the file's header tells a record from any other SQLite file.
-APPLICATION_ID = 0x4E465231
-SCHEMA_VERSION = 1
-#: A block longer than this is no block of ours, in bytes.
-MAX_BLOCK_BYTES = 1 << 20
-
-SCHEMA = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE block (
-    id INTEGER PRIMARY KEY, first_index INTEGER NOT NULL, n_samples INTEGER NOT NULL, n_axes INTEGER NOT NULL,
-    device_time REAL NOT NULL, arrival_time REAL NOT NULL, rate_lsb REAL NOT NULL, dtype TEXT NOT NULL,
-    temperature REAL, tilt_x REAL, tilt_y REAL,
-    specific_force_x REAL, specific_force_y REAL, specific_force_z REAL,
-    status INTEGER NOT NULL, n_lost INTEGER NOT NULL,
-    crc INTEGER NOT NULL, counts BLOB NOT NULL);
-CREATE TABLE stage_state (
-    id INTEGER PRIMARY KEY, device_time REAL NOT NULL, arrival_time REAL NOT NULL, mode TEXT NOT NULL,
-    azimuth REAL NOT NULL, elevation REAL NOT NULL, azimuth_rate REAL NOT NULL, elevation_rate REAL NOT NULL,
-    in_position INTEGER NOT NULL, fault TEXT NOT NULL);
-CREATE TABLE step (
-    id INTEGER PRIMARY KEY, name TEXT NOT NULL, azimuth REAL NOT NULL, elevation REAL NOT NULL, dwell REAL NOT NULL,
-    measured_azimuth REAL NOT NULL, measured_elevation REAL NOT NULL,
-    first_index INTEGER NOT NULL, stop_index INTEGER NOT NULL, sample_rate REAL NOT NULL);
-CREATE TABLE event (id INTEGER PRIMARY KEY, time REAL NOT NULL, kind TEXT NOT NULL, detail TEXT NOT NULL);
-CREATE TABLE fix (id INTEGER PRIMARY KEY, time REAL NOT NULL, value TEXT NOT NULL);
-"""
+from northfinder.record_schema import (
+    APPLICATION_ID,
+    MAX_BLOCK_BYTES,
+    MAX_ROW_BYTES,
+    NAMES,
+    SCHEMA_VERSION,
+    Row,
+    is_sound,
+)
 
 _DTYPES: dict[str, np.dtype[Any]] = {"<i4": np.dtype("<i4"), "<f4": np.dtype("<f4")}
+_STATUS = {int(status): status for status in (GyroStatus.OK, GyroStatus.OVERRUN)}  # the usual ones, quickly
+_ANY_INDEX = (0, 1 << 62)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,13 +46,29 @@ class DwellSpan:
     dwell: float  #: s
     measured_azimuth: float  #: rad, mean of the encoder over the dwell
     measured_elevation: float  #: rad
-    first_index: int  #: of the dwell's first sample
+    first_index: int  #: of the dwell's first sample in its stream
     stop_index: int  #: one past its last
     sample_rate: float  #: Hz
+    stream: int = 0  #: number of the gyro's stream; a measurement that was resumed has several
+    stream_start: float = 0.0  #: s, time of the stream's sample 0, from sample 0 of the first stream
+    turn_on: int = 0  #: how many times the gyro had been switched off and on since the first stream
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamInfo:
+    """One stream of the gyro: a measurement that was never interrupted has one."""
+
+    stream: int  #: its number, from 0
+    utc: float  #: s since 1970, when it was started
+    clock: float  #: s, the clock of the arrival times at that instant
+    sample_rate: float  #: Hz
+    n_axes: int
+    identities: dict[str, Any]  #: of the devices
+    software: str  #: version that recorded it
 
 
 @contextmanager
-def _one_line(path: Path, doing: str) -> Iterator[None]:
+def one_line(path: Path, doing: str) -> Iterator[None]:
     """Turn SQLite's exceptions into one sentence about the record."""
     try:
         yield
@@ -83,26 +76,42 @@ def _one_line(path: Path, doing: str) -> Iterator[None]:
         raise RecordError(f"the record {path} cannot be {doing}: {error}") from error
 
 
+def open_for_reading(path: Path) -> sqlite3.Connection:
+    """Return a connection that reads the record at `path` and never changes it.
+
+    Raises RecordError if it is no record of a version this program knows.
+    """
+    if not path.is_file():
+        raise RecordError(f"no record {path}: expected a file")
+    with one_line(path, "read"):
+        db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_ROW_BYTES)
+        try:
+            application_id = db.execute("PRAGMA application_id").fetchone()[0]
+            version = db.execute("PRAGMA user_version").fetchone()[0]
+        except sqlite3.OperationalError:  # it could be one, but not here: no rights, no room beside it
+            db.close()
+            raise
+        except sqlite3.DatabaseError:
+            db.close()
+            raise RecordError(f"{path} is no record of a measurement") from None
+    if application_id != APPLICATION_ID or version != SCHEMA_VERSION:
+        db.close()
+        found = f"version {version}" if application_id == APPLICATION_ID else "another kind of SQLite file"
+        raise RecordError(f"{path} is no record of version {SCHEMA_VERSION}: found {found}")
+    return db
+
+
 class Record:
-    """Reads a record, finished or left behind by a process that died. Use as a context manager."""
+    """Reads a record, finished or left behind by a process that died. Use as a context manager.
+
+    All that is read is bounded and checked: RecordError names what is damaged.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the file `path`. Raises RecordError if it is no record of a version this program knows."""
         self.path = path
-        if not path.is_file():
-            raise RecordError(f"no record {path}: expected a file")
-        with _one_line(path, "read"):
-            self._db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-            try:
-                application_id = self._db.execute("PRAGMA application_id").fetchone()[0]
-                version = self._db.execute("PRAGMA user_version").fetchone()[0]
-            except sqlite3.DatabaseError:
-                self._db.close()
-                raise RecordError(f"{path} is no record of a measurement") from None
-        if application_id != APPLICATION_ID or version != SCHEMA_VERSION:
-            self._db.close()
-            found = f"version {version}" if application_id == APPLICATION_ID else "another kind of SQLite file"
-            raise RecordError(f"{path} is no record of version {SCHEMA_VERSION}: found {found}")
+        self._db = open_for_reading(path)
 
     def __enter__(self) -> Self:
         """Return the record itself."""
@@ -114,48 +123,99 @@ class Record:
         """Close the file."""
         self._db.close()
 
+    def rows(self, table: str, first: int = 1) -> Iterator[Row]:
+        """Yield the rows of `table` from number `first` on, in order, without their checksum.
+
+        Raises RecordError at a row that is missing or altered.
+        """
+        number = first
+        query = f"SELECT {NAMES[table]} FROM {table} WHERE id >= ? ORDER BY id"  # noqa: S608  # names of ours
+        with one_line(self.path, "read"):
+            for row in self._db.execute(query, (first,)):
+                if row[0] != number:
+                    raise self._damaged(f"row {number} of {table} is missing")
+                if not is_sound(table, row):
+                    raise self._damaged(f"row {number} of {table} does not match its checksum")
+                number += 1
+                yield row[:-1]
+
+    def count(self, table: str) -> int:
+        """Return how many rows `table` has, by the number of its last one."""
+        with one_line(self.path, "read"):
+            found = self._db.execute(f"SELECT max(id) FROM {table}").fetchone()[0]  # noqa: S608  # names of ours
+        return found if isinstance(found, int) else 0
+
+    def _damaged(self, what: str) -> RecordError:
+        return RecordError(f"the record {self.path} is damaged: {what}; northfinder recover saves the rest")
+
     def meta(self, key: str) -> Any:  # noqa: ANN401  # as it was given to set_meta
-        """Return the value kept under `key`, None if there is none."""
-        with _one_line(self.path, "read"):
-            row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        """Return the value kept under `key`, None if there is none; the newest, if it was kept several times."""
+        found = None
+        for _, name, value in self.rows("meta"):
+            found = value if name == key else found
+        return None if found is None else self._decoded(found, f"its entry {key!r}")
+
+    def _decoded(self, text: str, what: str) -> Any:  # noqa: ANN401  # any plain data
         try:
-            return None if row is None else msgspec.json.decode(row[0])
-        except msgspec.DecodeError:
-            raise RecordError(f"the record {self.path} is damaged: its entry {key!r} is no JSON") from None
+            return msgspec.json.decode(text)
+        except (msgspec.DecodeError, RecursionError):
+            raise self._damaged(f"{what} is no JSON") from None
+
+    def streams(self) -> list[StreamInfo]:
+        """Return the streams of the gyro in order; none if the measurement ended before."""
+        return [
+            StreamInfo(
+                stream=stream, utc=utc, clock=clock, sample_rate=sample_rate, n_axes=n_axes,
+                identities=self._decoded(identities, f"the identities of stream {stream}"), software=software,
+            )
+            for _, stream, utc, clock, sample_rate, n_axes, identities, software in self.rows("stream")
+        ]  # fmt: skip
 
     def steps(self) -> list[DwellSpan]:
         """Return the finished dwells in order."""
-        with _one_line(self.path, "read"):
-            rows = self._db.execute("SELECT * FROM step ORDER BY id").fetchall()
-        return [DwellSpan(**dict(zip(DwellSpan.__slots__, row, strict=True))) for row in rows]
+        return [DwellSpan(**dict(zip(DwellSpan.__slots__, row[1:], strict=True))) for row in self.rows("step")]
 
-    def blocks(self, first_index: int = 0, stop_index: int = 1 << 62) -> Iterator[RateBlock]:
+    def blocks(
+        self, first_index: int = _ANY_INDEX[0], stop_index: int = _ANY_INDEX[1], *, stream: int | None = None
+    ) -> Iterator[RateBlock]:
         """Yield the blocks that hold a sample of ``first_index <= index < stop_index``, in order.
 
-        Raises RecordError at a block whose counts do not match their length or their CRC.
+        Of the `stream` given, found quickly, or of all streams. Raises RecordError at a block that is missing or
+        altered.
         """
-        query = (
-            "SELECT id, first_index, n_samples, n_axes, device_time, arrival_time, rate_lsb, dtype, temperature,"
-            " tilt_x, tilt_y, specific_force_x, specific_force_y, specific_force_z,"
-            " status, n_lost, crc, counts FROM block"
-            " WHERE first_index < ? AND first_index + n_samples > ? ORDER BY id"
-        )
-        with _one_line(self.path, "read"):
-            for row in self._db.execute(query, (stop_index, first_index)):
+        first = 1 if stream is None else self._first_block(stream, first_index)
+        for row in self.rows("block", first):
+            if stream is not None and (row[1], row[2]) >= (stream, stop_index):
+                return
+            if row[2] < stop_index and row[2] + row[3] > first_index:
                 yield self._block(row)
 
-    def _block(self, row: tuple[Any, ...]) -> RateBlock:
-        number, first, n_samples, n_axes, device_time, arrival_time, lsb, dtype, temperature, x, y, *rest = row
-        force_x, force_y, force_z, status, n_lost, crc, data = rest
-        sound = (
-            dtype in _DTYPES
-            and isinstance(data, bytes)
-            and len(data) <= MAX_BLOCK_BYTES
-            and len(data) == 4 * n_samples * n_axes
-            and fastcrc.crc32.iscsi(data) == crc
-        )
-        if not sound:
-            raise RecordError(f"the record {self.path} is damaged: block {number} does not match its checksum")
+    def blocks_of(self, span: DwellSpan) -> Iterator[RateBlock]:
+        """Yield the blocks that hold the samples of a dwell, in order."""
+        return self.blocks(span.first_index, span.stop_index, stream=span.stream)
+
+    def _first_block(self, stream: int, index: int) -> int:
+        """Return the number of the first block that ends after sample `index` of `stream`: they are in that order."""
+        low, high = 1, self.count("block") + 1
+        query = "SELECT id, stream, first_index + n_samples FROM block WHERE id >= ? ORDER BY id LIMIT 1"
+        with one_line(self.path, "read"):
+            while low < high:
+                middle = (low + high) // 2
+                row = self._db.execute(query, (middle,)).fetchone()
+                if row is None or not all(isinstance(value, int) for value in row):
+                    raise self._damaged(f"row {middle} of block cannot be read")
+                if (row[1], row[2]) > (stream, index):
+                    high = middle
+                else:
+                    low = middle + 1
+        return low
+
+    def _block(self, row: Row) -> RateBlock:
+        number, _, first, n_samples, n_axes, device_time, arrival_time, lsb, dtype, temperature, x, y, *rest = row
+        force_x, force_y, force_z, status, n_lost, data = rest
+        possible = dtype in _DTYPES and n_axes > 0 and len(data) == 4 * n_samples * n_axes <= MAX_BLOCK_BYTES
+        if not possible or lsb is None or status < 0:
+            raise self._damaged(f"row {number} of block is no block of samples")
         return RateBlock(
             first_index=first,
             device_time=device_time,
@@ -165,37 +225,37 @@ class Record:
             temperature=temperature,
             tilt=None if x is None or y is None else (x, y),
             specific_force=None if None in {force_x, force_y, force_z} else (force_x, force_y, force_z),
-            status=GyroStatus(status),
+            status=_STATUS.get(status) or GyroStatus(status),
             n_lost=n_lost,
         )
 
     def states(self) -> list[StageState]:
         """Return the reported states of the stage in order."""
-        with _one_line(self.path, "read"):
-            rows = self._db.execute(
-                "SELECT device_time, arrival_time, mode, azimuth, elevation, azimuth_rate, elevation_rate,"
-                " in_position, fault FROM stage_state ORDER BY id"
-            ).fetchall()
-        return [
-            StageState(
-                device_time=row[0], arrival_time=row[1], mode=StageMode(row[2]), azimuth=row[3], elevation=row[4],
-                azimuth_rate=row[5], elevation_rate=row[6], in_position=bool(row[7]), fault=row[8],
-            )
-            for row in rows
-        ]  # fmt: skip
+        try:
+            return [
+                StageState(
+                    device_time=row[2], arrival_time=row[3], mode=StageMode(row[4]), azimuth=row[5], elevation=row[6],
+                    azimuth_rate=row[7], elevation_rate=row[8], in_position=bool(row[9]), fault=row[10],
+                )
+                for row in self.rows("stage_state")
+            ]  # fmt: skip
+        except ValueError as error:
+            raise self._damaged(f"a state of the stage cannot be: {error}") from None
 
     def events(self) -> list[tuple[float, str, str]]:
-        """Return (time, kind, detail) of what happened, in order."""
-        with _one_line(self.path, "read"):
-            return self._db.execute("SELECT time, kind, detail FROM event ORDER BY id").fetchall()
+        """Return (time, kind, detail) of what happened, in order; the operator's notes among it as kind "note"."""
+        events = [(time, kind, detail) for _, _, time, kind, detail in self.rows("event")]
+        notes = self.notes()
+        return sorted(events + notes, key=lambda event: event[0]) if notes else events
+
+    def notes(self) -> list[tuple[float, str, str]]:
+        """Return (time, "note", text) of the operator's notes, in order."""
+        return [(time, "note", text) for _, time, text in self.rows("note")]
 
     def is_complete(self) -> bool:
         """Return whether the measurement went on to its fix, rather than ending early."""
-        with _one_line(self.path, "read"):
-            return bool(self._db.execute("SELECT count(*) FROM fix").fetchone()[0])
+        return self.count("fix") > 0
 
     def fixes(self) -> list[Any]:
         """Return what was estimated, oldest first."""
-        with _one_line(self.path, "read"):
-            rows = self._db.execute("SELECT value FROM fix ORDER BY id").fetchall()
-        return [msgspec.json.decode(row[0]) for row in rows]
+        return [self._decoded(value, f"fix {number}") for number, _, value in self.rows("fix")]

@@ -5,48 +5,58 @@ A stage stops by itself when its host is silent for a quarter of a second, which
 
 from __future__ import annotations
 
-import queue
-import sqlite3
-import threading
-from collections.abc import Callable
-from contextlib import suppress
+import math
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
-import fastcrc
 import msgspec
 import numpy as np
 
-from drivers.api import RateBlock, StageState
+from drivers.api import DeviceIdentity, RateBlock, StageState
+from northfinder import record_writer
 from northfinder.errors import RecordError
-from northfinder.record import APPLICATION_ID, SCHEMA, SCHEMA_VERSION, DwellSpan
+from northfinder.record import DwellSpan, Record
+from northfinder.record_schema import MAX_BLOCK_BYTES, TABLES, Row, sealed
 
 #: What has arrived is handed to the file at least this often, in s.
 WRITE_PERIOD = 0.1
-#: How long the disk may keep the end of a measurement waiting, in s.
-CLOSE_TIMEOUT = 60.0
-#: So many writes may wait for the disk, two minutes of them, before the measurement is given up.
-MAX_WAITING = 1200
-
-#: A statement and the rows to execute it with.
-Insert = tuple[str, list[tuple[object, ...]]]
+#: What a row takes beside its counts, a state of the stage, how often one comes, and what a record takes besides.
+_ROW_BYTES, _STATE_BYTES, _STATES_PER_S, _OTHER_BYTES = 110, 110, 10.0, 24_000_000
+#: The shortest block that a gyro is expected to send, in samples; shorter ones take more room.
+_BLOCK_SAMPLES = 20
 
 
 class Recorder:
-    """Writes a new record. Use as a context manager; whatever ends the block, the record is closed."""
+    """Writes a record. Use as a context manager; whatever ends the block, the record is closed."""
 
-    def __init__(self, path: Path, now: Callable[[], float]) -> None:
-        """Create the file `path`, which must not exist; `now` tells the host's time in s. Raises RecordError."""
+    def __init__(
+        self, path: Path, now: Callable[[], float], *, clock: Callable[[], float] | None = None, resume: bool = False
+    ) -> None:
+        """Create the file `path`, which must not exist, or with `resume` go on with it. Raises RecordError.
+
+        `now` tells the date in s since 1970, `clock` a time that never goes back, by default the same.
+        """
         self.path = path
-        self._now = now
-        self._blocks: list[tuple[object, ...]] = []
-        self._states: list[tuple[object, ...]] = []
-        self._next_write = now() + WRITE_PERIOD
+        self.now = now  #: the date in s since 1970
+        self._clock = clock or now
+        self._pending: dict[str, list[Row]] = {"block": [], "stage_state": []}
+        self._pending_bytes = 0
+        self._next_write = self._clock() + WRITE_PERIOD
         self._closed = False
         self.n_samples = 0
         self.n_lost = 0
-        self._writer = _Writer(path, _create(path))
+        self.stream = 0  #: number of the gyro's stream that is being recorded
+        self._next_row = dict.fromkeys(TABLES, 1)
+        if resume:
+            with Record(path) as record:
+                self._next_row = {table: record.count(table) + 1 for table in TABLES}
+                self.stream = max((info.stream for info in record.streams()), default=-1) + 1
+        opened = record_writer.reopen(path) if resume else record_writer.create(path)
+        self._writer = record_writer.Writer(path, opened)
         self._writer.start()
 
     def __enter__(self) -> Self:
@@ -63,81 +73,104 @@ class Recorder:
             if error is None:
                 raise
 
+    @property
+    def delay(self) -> float:
+        """For how long the disk has been busy with what it was given, in s."""
+        return self._writer.delay
+
+    def require_space(self, duration: float, sample_rate: float, n_axes: int) -> None:
+        """Raise RecordError unless the disk has room for `duration` s of a gyro with this rate, in Hz, and axes."""
+        needed = expected_bytes(duration, sample_rate, n_axes)
+        try:
+            free = shutil.disk_usage(self.path.parent).free
+        except OSError:  # it cannot be told; what does not fit is said when it is written
+            return
+        if free < needed:
+            raise RecordError(
+                f"the disk of {self.path.parent} has {free / 1e6:.0f} MB free, the record of this plan takes up to "
+                f"{needed / 1e6:.0f} MB: make room, or record elsewhere with --out"
+            )
+
     def set_meta(self, key: str, value: object) -> None:
         """Keep `value`, anything that can be JSON, under `key`."""
-        row: tuple[object, ...] = (key, msgspec.json.encode(value).decode())
-        self._put(("INSERT OR REPLACE INTO meta VALUES (?, ?)", [row]))
+        self._put("meta", key, msgspec.json.encode(value).decode())
+
+    def begin_stream(
+        self, identities: Mapping[str, DeviceIdentity], *, sample_rate: float, n_axes: int, software: str = ""
+    ) -> None:
+        """Keep that the gyro starts a stream now, and from what."""
+        value = msgspec.json.encode(dict(identities)).decode()
+        self._put("stream", self.stream, self.now(), self._clock(), sample_rate, n_axes, value, software)
 
     def add_block(self, block: RateBlock) -> None:
-        """Keep a block of samples."""
+        """Keep a block of samples; of at most MAX_BLOCK_BYTES, see `parts`."""
         counts = np.ascontiguousarray(block.counts)
         data = counts.astype(counts.dtype.newbyteorder("<"), copy=False).tobytes()
+        if len(data) > MAX_BLOCK_BYTES:
+            raise RecordError(f"a block of {len(data)} bytes is too long for a record: at most {MAX_BLOCK_BYTES}")
         dtype = "<f4" if counts.dtype.kind == "f" else "<i4"
         tilt = block.tilt if block.tilt is not None else (None, None)
         force = block.specific_force if block.specific_force is not None else (None, None, None)
-        self._blocks.append(
-            (
-                block.first_index, counts.shape[0], counts.shape[1], block.device_time, block.arrival_time,
-                block.rate_lsb, dtype, block.temperature, *tilt, *force, int(block.status), block.n_lost,
-                fastcrc.crc32.iscsi(data), data,
-            )
+        self._keep(
+            "block", self.stream, block.first_index, counts.shape[0], counts.shape[1], block.device_time,
+            block.arrival_time, block.rate_lsb, dtype, block.temperature, *tilt, *force, block.status, block.n_lost,
+            data,
         )  # fmt: skip
+        self._pending_bytes += len(data)
         self.n_samples += counts.shape[0]
         self.n_lost += block.n_lost
         self._write_if_due()
 
     def add_state(self, state: StageState) -> None:
         """Keep a reported state of the stage."""
-        self._states.append(
-            (
-                state.device_time, state.arrival_time, state.mode.value, state.azimuth, state.elevation,
-                state.azimuth_rate, state.elevation_rate, int(state.in_position), state.fault,
-            )
+        self._keep(
+            "stage_state", self.stream, state.device_time, state.arrival_time, state.mode.value, state.azimuth,
+            state.elevation, state.azimuth_rate, state.elevation_rate, state.in_position, state.fault,
         )  # fmt: skip
         self._write_if_due()
 
     def add_step(self, span: DwellSpan) -> None:
         """Keep a finished dwell."""
-        self.write()
-        row: tuple[object, ...] = (
-            span.step, span.name, span.azimuth, span.elevation, span.dwell, span.measured_azimuth,
-            span.measured_elevation, span.first_index, span.stop_index, span.sample_rate,
-        )  # fmt: skip
-        self._put(("INSERT INTO step VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", [row]))
+        self._put("step", *(getattr(span, name) for name in DwellSpan.__slots__))
 
     def add_event(self, kind: str, detail: str = "") -> None:
         """Keep that something happened now."""
-        self.write()
-        self._put(("INSERT INTO event (time, kind, detail) VALUES (?, ?, ?)", [(self._now(), kind, detail)]))
+        self._put("event", self.stream, self.now(), kind, detail)
 
     def add_fix(self, value: object) -> None:
         """Keep what was estimated."""
+        self._put("fix", self.now(), msgspec.json.encode(value).decode())
+
+    def _row(self, table: str, *values: Any) -> Row:  # noqa: ANN401  # whatever the columns hold
+        row = sealed(table, self._next_row[table], values)
+        self._next_row[table] += 1
+        return row
+
+    def _keep(self, table: str, *values: Any) -> None:  # noqa: ANN401  # whatever the columns hold
+        self._pending[table].append(self._row(table, *values))
+
+    def _put(self, table: str, *values: Any) -> None:  # noqa: ANN401  # whatever the columns hold
+        """Hand over one row, after all that came before it."""
         self.write()
-        row: tuple[object, ...] = (self._now(), msgspec.json.encode(value).decode())
-        self._put(("INSERT INTO fix (time, value) VALUES (?, ?)", [row]))
+        self._writer.put([(table, [self._row(table, *values)])])
 
     def _write_if_due(self) -> None:
-        if self._now() >= self._next_write:
+        if self._clock() >= self._next_write:
             self.write()
 
     def write(self) -> None:
         """Hand over to the file all that has arrived. Raises RecordError if it has failed to take what came before."""
-        self._next_write = self._now() + WRITE_PERIOD
-        blocks, self._blocks = self._blocks, []
-        states, self._states = self._states, []
-        if blocks or states:
-            self._put(
-                ("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", blocks),
-                ("INSERT INTO stage_state VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?, ?)", states),
-            )
+        self._next_write = self._clock() + WRITE_PERIOD
+        batches = [(table, rows) for table, rows in self._pending.items() if rows]
+        n_bytes, self._pending_bytes = self._pending_bytes, 0
+        self._pending = {table: [] for table in self._pending}
+        if batches:
+            self._writer.put(batches, n_bytes)
 
     def flush(self) -> None:
         """Wait until the file holds all that has arrived. Raises RecordError."""
         self.write()
         self._writer.flush()
-
-    def _put(self, *inserts: Insert) -> None:
-        self._writer.put(inserts)
 
     def close(self) -> None:
         """Write what is left and make one file of the record. Closing twice is no error. Raises RecordError."""
@@ -150,104 +183,25 @@ class Recorder:
             self._writer.close()
 
 
-def _create(path: Path) -> sqlite3.Connection:
-    """Return a connection to a new, empty record."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("xb").close()
-    except FileExistsError:
-        raise RecordError(f"the record {path} exists already, and records are never overwritten") from None
-    except OSError as error:
-        raise RecordError(f"the record {path} cannot be created: {error.strerror}") from None
-    try:
-        # Made here and used in the writer's thread alone from then on.
-        db = sqlite3.connect(path, timeout=CLOSE_TIMEOUT, isolation_level=None, check_same_thread=False)
-        db.execute("PRAGMA journal_mode = WAL")
-        db.execute("PRAGMA synchronous = FULL")
-        db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-        db.executescript(SCHEMA)
-    except sqlite3.Error as error:
-        raise RecordError(f"the record {path} cannot be created: {error}") from error
-    return db
+def expected_bytes(duration: float, sample_rate: float, n_axes: int) -> int:
+    """Return the most that the record of `duration` s takes, at a sample rate in Hz."""
+    per_s = sample_rate * (4 * n_axes + _ROW_BYTES / _BLOCK_SAMPLES) + _STATES_PER_S * _STATE_BYTES
+    return round(1.1 * duration * per_s) + _OTHER_BYTES
 
 
-class _Writer(threading.Thread):
-    """Executes inserts in the order they come; those that have come meanwhile go into one transaction.
-
-    The first failure ends it: it is raised once, and the record takes nothing more.
-    """
-
-    def __init__(self, path: Path, db: sqlite3.Connection) -> None:
-        super().__init__(name="recorder", daemon=True)
-        self._path = path
-        self._db = db
-        self._waiting: queue.Queue[tuple[Insert, ...] | threading.Event | None] = queue.Queue(MAX_WAITING)
-        self._error: str | None = None
-        self._told = False
-
-    def put(self, inserts: tuple[Insert, ...]) -> None:
-        """Take inserts. Raises RecordError, once, if the writer has failed."""
-        self._tell()
-        try:
-            self._waiting.put_nowait(inserts)
-        except queue.Full:
-            self._error = "the disk has taken nothing for too long"
-            self._tell()
-
-    def flush(self) -> None:
-        """Wait until all that was taken has been written. Raises RecordError, once, if the writer has failed."""
-        written = threading.Event()
-        self._waiting.put(written)
-        if not written.wait(CLOSE_TIMEOUT):
-            self._error = f"the disk has taken nothing for {CLOSE_TIMEOUT:g} s"
-        self._tell()
-
-    def close(self) -> None:
-        """Make one file of the record. Raises RecordError, once, if anything could not be written."""
-        self._waiting.put(None)
-        self.join(CLOSE_TIMEOUT)
-        self._tell()
-
-    def run(self) -> None:
-        """Write until told to end."""
-        while True:
-            batch = [self._waiting.get()]
-            with suppress(queue.Empty):
-                while True:
-                    batch.append(self._waiting.get_nowait())
-            self._write([insert for item in batch if isinstance(item, tuple) for insert in item])
-            for item in batch:
-                if isinstance(item, threading.Event):
-                    item.set()
-            if None in batch:
-                break
-        self._finish()
-
-    def _write(self, inserts: list[Insert]) -> None:
-        """Execute inserts, all or none."""
-        if self._error is not None or not inserts:
-            return
-        try:
-            self._db.execute("BEGIN")
-            for statement, rows in inserts:
-                self._db.executemany(statement, rows)
-            self._db.execute("COMMIT")
-        except sqlite3.Error as error:
-            self._error = str(error)
-            with suppress(sqlite3.Error):
-                self._db.rollback()
-
-    def _finish(self) -> None:
-        try:
-            self._db.execute("PRAGMA journal_mode = DELETE")
-        except sqlite3.Error as error:
-            self._error = self._error or str(error)
-        finally:
-            self._db.close()
-
-    def _tell(self) -> None:
-        """Raise what has gone wrong, once."""
-        if self._error is not None and not self._told:
-            self._told = True
-            raise RecordError(f"the record {self._path} cannot be written: {self._error}")
+def parts(block: RateBlock, sample_rate: float) -> Iterator[RateBlock]:
+    """Yield the block in parts that a record takes; nearly always that is the block itself."""
+    n_samples, n_axes = block.counts.shape
+    most = MAX_BLOCK_BYTES // (4 * n_axes)
+    if n_samples <= most:
+        yield block
+        return
+    for k in range(math.ceil(n_samples / most)):
+        first = k * most
+        yield replace(
+            block,
+            first_index=block.first_index + first,
+            device_time=block.device_time + first / sample_rate,
+            counts=block.counts[first : first + most],
+            n_lost=0 if k else block.n_lost,
+        )

@@ -130,5 +130,5 @@ def reduce_record(record: Record) -> Reduction:
     """Reduce all finished dwells of a record. Raises RecordError."""
     reduction = Reduction()
     for span in record.steps():
-        reduction.add(span, record.blocks(span.first_index, span.stop_index))
+        reduction.add(span, record.blocks_of(span))
     return reduction

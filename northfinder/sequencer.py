@@ -21,7 +21,8 @@ from northfinder.cyclogram import Standing, Step, reachable_azimuth
 from northfinder.errors import NorthFinderError, SequenceError
 from northfinder.estimation import Fix
 from northfinder.record import DwellSpan
-from northfinder.recorder import Recorder
+from northfinder.recorder import Recorder, parts
+from northfinder.streams import Earlier, StreamPlace
 
 
 class State(Enum):
@@ -77,6 +78,10 @@ SERVICE_PERIOD = 0.05
 HOME_TIMEOUT = 180.0
 #: Stage time beyond twice its calculated duration within which a slew must end, in s.
 SLEW_MARGIN = 10.0
+#: For how many times its dwells, and how long besides a step, a plan is given room on the disk; times in s.
+SPACE_FACTOR, SPACE_PER_STEP = 1.5, 30.0
+#: What a stage latches when its host falls silent: the one fault that is expected after an interruption.
+HOST_SILENT = {"WATCHDOG", "HEARTBEAT"}
 
 
 class StopRequestedError(NorthFinderError):
@@ -121,6 +126,7 @@ class Progress:
     stage: StageState | None = None
     n_samples: int = 0
     n_lost: int = 0
+    record_delay: float = 0.0  #: s for which the disk has not taken what it was given
 
 
 class Observer(Protocol):
@@ -145,17 +151,23 @@ class Sequencer:
     observer: Observer
     settle: float = 0.5  #: s of samples left out after each slew
     stop_requested: Callable[[], bool] = lambda: False
+    earlier: Earlier = field(default_factory=Earlier)  #: what was done before an interruption
     gyro: Gyro | None = None
     stage: Stage | None = None
     identities: dict[str, DeviceIdentity] = field(default_factory=dict)
     spans: list[DwellSpan] = field(default_factory=list)
-    _fix: Fix | None = None  #: from the dwells so far
+    fix: Fix | None = None  #: from the dwells so far
+    _place: StreamPlace = field(default_factory=StreamPlace)
     _step: Step | None = None
     _next_index: int = 0  #: one past the newest sample
     _blocks: list[RateBlock] = field(default_factory=list)  #: of the present dwell
     _state: StageState | None = None
     _now: State = State.CONNECT
     _failure: Exception | None = None
+
+    def __post_init__(self) -> None:
+        """Go on after what was done before."""
+        self.spans.extend(self.earlier.spans)
 
     def run(self) -> list[DwellSpan]:
         """Run the measurement and return its dwells.
@@ -209,8 +221,12 @@ class Sequencer:
         self.identities = {"gyro": gyro.connect(), "stage": stage.connect()}
         self.recorder.set_meta("identities", self.identities)
         self.recorder.set_meta("sample_rate", gyro.sample_rate)
+        self.earlier.check(self.identities["gyro"], sample_rate=gyro.sample_rate, n_axes=gyro.n_axes)
         self.plan.check(stage.limits)
         self.recorder.set_meta("plan", self.plan.outline())
+        n_done = len(self.spans)
+        duration = SPACE_FACTOR * self.plan.remaining_dwell(n_done) + SPACE_PER_STEP * (self.plan.n_steps - n_done)
+        self.recorder.require_space(duration, gyro.sample_rate, gyro.n_axes)
         return Event.OK
 
     def _self_test(self) -> Event:
@@ -226,12 +242,24 @@ class Sequencer:
     def _home(self) -> Event:
         gyro, stage = self._devices()
         state = self._service_stage()
+        if self.recorder.stream and state.mode is StageMode.FAULT and state.fault in HOST_SILENT:
+            state = self._rearm(stage, state.fault)
         if state.mode is not StageMode.IDLE:
             stage.home()
             deadline = state.device_time + HOME_TIMEOUT
             self._serve(lambda: self._at_rest(deadline, "homing"), stream=False)
+        self.recorder.begin_stream(self.identities, sample_rate=gyro.sample_rate, n_axes=gyro.n_axes)
         gyro.start()
         return Event.OK
+
+    def _rearm(self, stage: Stage, fault: str) -> StageState:
+        """Clear what the interruption itself has made the stage latch: the operator has asked to go on."""
+        self.recorder.add_event("fault cleared", fault)
+        stage.clear_fault()
+        deadline = self.clock.now() + STOP_TIMEOUT
+        while (state := self._service_stage()).mode is StageMode.FAULT and self.clock.now() < deadline:
+            self.clock.wait(self.clock.now() + SERVICE_PERIOD)
+        return state
 
     def _slew(self) -> Event:
         stage = self._devices()[1]
@@ -263,7 +291,7 @@ class Sequencer:
         rate = self._devices()[0].sample_rate
         stop = first + round(step.dwell * rate)
         if step.deadline is not None:
-            stop = min(stop, math.floor(step.deadline * rate))
+            stop = min(stop, math.floor((step.deadline - self.earlier.elapsed) * rate))
         stop = max(stop, first + 1)
         self._blocks = []
         states: list[StageState] = [self._service_stage()]
@@ -287,10 +315,13 @@ class Sequencer:
             first_index=first,
             stop_index=stop,
             sample_rate=rate,
+            stream=self.recorder.stream,
+            stream_start=self._place.start,
+            turn_on=self._place.turn_on,
         )
         self.spans.append(span)
         self.recorder.add_step(span)
-        self._fix = self.observer.on_dwell(span, self._blocks)
+        self.fix = self.observer.on_dwell(span, self._blocks)
         return Event.OK
 
     def _finish(self) -> Event:
@@ -314,8 +345,8 @@ class Sequencer:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last sample, in s."""
-        return self._next_index / self._devices()[0].sample_rate
+        """Time of the plan that has passed, in s: from the first to the last sample, without interruptions."""
+        return self.earlier.elapsed + self._next_index / self._devices()[0].sample_rate
 
     # What they share
 
@@ -327,7 +358,7 @@ class Sequencer:
     def _standing(self, state: StageState) -> Standing:
         return Standing(
             done=tuple(self.spans),
-            fix=self._fix,
+            fix=self.fix,
             elapsed=self.duration,
             azimuth=state.azimuth,
             elevation=state.elevation,
@@ -373,7 +404,9 @@ class Sequencer:
             state = self._service_stage()
             if state.mode is StageMode.FAULT:
                 raise DeviceFaultError(f"the stage reports {state.fault}; it stays stopped until the fault is cleared")
-            blocks = gyro.read() if stream else []
+            blocks = [part for block in gyro.read() for part in parts(block, gyro.sample_rate)] if stream else []
+            if blocks and not self._next_index:
+                self._place = self._placed(blocks[0])
             for block in blocks:
                 self.recorder.add_block(block)
                 self._next_index = block.first_index + len(block.counts)
@@ -385,6 +418,11 @@ class Sequencer:
                 return
             if not blocks and state is before:  # else look again first: the devices wait for word of what has come
                 self.clock.wait(self.clock.now() + SERVICE_PERIOD)
+
+    def _placed(self, block: RateBlock) -> StreamPlace:
+        """Return where the stream that begins with `block` lies after what was done before."""
+        sample_rate, utc = self._devices()[0].sample_rate, self.recorder.now()
+        return self.earlier.place(block, self.identities["gyro"], sample_rate=sample_rate, utc=utc)
 
     def _serve_until_index(self, index: int) -> None:
         self._serve(lambda: self._next_index >= index)
@@ -417,5 +455,6 @@ class Sequencer:
                 stage=self._state,
                 n_samples=self.recorder.n_samples,
                 n_lost=self.recorder.n_lost,
+                record_delay=self.recorder.delay,
             )
         )

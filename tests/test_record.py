@@ -169,10 +169,10 @@ def test_a_full_disk_is_said_at_once(tmp_path: Path) -> None:
     recorder.flush()
     pages = recorder._writer._db.execute("PRAGMA page_count").fetchone()[0]
     recorder._writer._db.execute(f"PRAGMA max_page_count = {pages}")
-    recorder.add_block(block(4, n=60_000))
+    recorder.add_block(block(4, n=8_000))
     with pytest.raises(RecordError, match=r"north.sqlite cannot be written: database or disk is full"):
         recorder.flush()
-    recorder.add_block(block(60_004))  # taken no more, and not said again
+    recorder.add_block(block(8_004))  # taken no more, and not said again
     recorder.close()
     with Record(path) as record:
         assert [each.first_index for each in record.blocks()] == [0]
@@ -214,5 +214,5 @@ def test_an_altered_block_is_found(tmp_path: Path) -> None:
         data[5] ^= 1
         db.execute("UPDATE block SET counts = ?", (bytes(data),))
     db.close()
-    with Record(path) as record, pytest.raises(RecordError, match="block 1 does not match its checksum"):
+    with Record(path) as record, pytest.raises(RecordError, match="row 1 of block does not match its checksum"):
         list(record.blocks())

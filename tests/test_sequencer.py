@@ -214,7 +214,7 @@ def test_a_full_disk_stops_the_stage(tmp_path: Path) -> None:
     """When the record cannot grow the measurement ends with that sentence, and the stage is at rest."""
     bench = virtual_bench()
     with sequencer(bench, tmp_path / "r.sqlite") as sequence:
-        sequence.recorder._writer._db.execute("PRAGMA max_page_count = 60")
+        sequence.recorder._writer._db.execute("PRAGMA max_page_count = 30")
         with pytest.raises(RecordError, match="database or disk is full"):
             sequence.run()
     assert stage_speed(bench, 0.0) == 0.0

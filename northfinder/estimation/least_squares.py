@@ -218,7 +218,7 @@ def _bias_terms(
     if design.drift != "linear":
         return tuple(bias.tolist()), tuple(bias_sd.tolist()), (), ()
     span = half_span(design.means)
-    slope, slope_sd = coefficients[1::n_bias] / span, np.sqrt(np.diag(cov)[1::n_bias]) / span
+    slope, slope_sd = coefficients[n_bias - 1 :: n_bias] / span, np.sqrt(np.diag(cov)[n_bias - 1 :: n_bias]) / span
     return tuple(bias.tolist()), tuple(bias_sd.tolist()), tuple(slope.tolist()), tuple(slope_sd.tolist())
 
 

@@ -79,14 +79,20 @@ def build_design(means: RateMeans, drift: Drift, *, bias_known: bool = False) ->
         pair = np.unique(means.dwell, return_inverse=True)[1] // 2
         bias = (pair[:, np.newaxis] == np.arange(pair[-1] + 1)).astype(np.float64)
     elif drift == "linear":
-        bias = np.column_stack([np.ones(means.n), reduced_time(means)])
+        bias = np.column_stack([_of_turn_ons(means), reduced_time(means)])
     else:
-        bias = np.ones((means.n, 1))
+        bias = _of_turn_ons(means)
     h = sensitivity(means.azimuth, means.elevation, means.tilt, n_axes=means.n_axes)
     rows = _stack(h, bias)
     if bias_known:
         rows = np.vstack([rows, math.sqrt(means.n) * _mean_biases(means.n_axes, bias)])
     return Design(means, h, bias, drift, bias_known, vertical=_check_determined(rows))
+
+
+def _of_turn_ons(means: RateMeans) -> Array:
+    """Return a column of ones for each turn-on of the gyro, zero in the rows of the others."""
+    turn_ons = np.unique(means.turn_on)
+    return (means.turn_on[:, np.newaxis] == turn_ons).astype(np.float64)
 
 
 def per_dwell(design: Design) -> Design | None:

@@ -37,6 +37,8 @@ class RateMeans:
         Which dwell a mean belongs to, never decreasing; numbered 0, 1, ... if not given.
     n_samples : (n,) int array
         Samples in the mean; 1 if not given.
+    turn_on : (n,) int array
+        How many times the gyro had been switched off and on by then, never decreasing; 0 if not given.
 
     Raises
     ------
@@ -55,6 +57,7 @@ class RateMeans:
     specific_force: Array
     dwell: NDArray[np.int64]
     n_samples: NDArray[np.int64]
+    turn_on: NDArray[np.int64]
 
     def __init__(
         self,
@@ -68,6 +71,7 @@ class RateMeans:
         specific_force: ArrayLike | None = None,
         dwell: ArrayLike | None = None,
         n_samples: ArrayLike | None = None,
+        turn_on: ArrayLike | None = None,
     ) -> None:
         given = {"start": start, "duration": duration, "rate": rate, "azimuth": azimuth, "elevation": elevation}
         for name, value in given.items():
@@ -80,6 +84,7 @@ class RateMeans:
             object.__setattr__(self, name, given_or_zero)
         whole = {"dwell": np.arange(n) if dwell is None else dwell}
         whole["n_samples"] = np.ones(n, dtype=np.int64) if n_samples is None else n_samples
+        whole["turn_on"] = np.zeros(n, dtype=np.int64) if turn_on is None else turn_on
         for name, value in whole.items():
             object.__setattr__(self, name, np.array(value, dtype=np.int64))
         self._check()
@@ -99,7 +104,7 @@ class RateMeans:
             raise EstimateError("there are no rate means to estimate from")
         if np.any(self.duration <= 0.0) or np.any(self.n_samples < 1):
             raise EstimateError("every mean needs a positive duration and at least one sample")
-        if np.any(self.gap < 0.0) or np.any(np.diff(self.dwell) < 0):
+        if np.any(self.gap < 0.0) or np.any(np.diff(self.dwell) < 0) or np.any(np.diff(self.turn_on) < 0):
             raise EstimateError("the means must be in order of time and must not overlap")
 
     @property
@@ -152,10 +157,9 @@ class RateMeans:
 
         names = ("rate", "azimuth", "elevation", "tilt", "specific_force")
         averaged = {name: mean(getattr(self, name)) for name in names}
+        whole = {"dwell": self.dwell[first], "turn_on": self.turn_on[first]}
         n_samples = np.add.reduceat(self.n_samples, first)
-        return RateMeans(
-            start=self.start[first], duration=total, dwell=self.dwell[first], n_samples=n_samples, **averaged
-        )
+        return RateMeans(start=self.start[first], duration=total, n_samples=n_samples, **whole, **averaged)
 
 
 def concatenate(parts: Sequence[RateMeans]) -> RateMeans:
@@ -178,6 +182,8 @@ def from_samples(
     tilt: tuple[float, float] = (0.0, 0.0),
     specific_force: ArrayLike = (0.0, 0.0, 0.0),
     dwell: int = 0,
+    stream_start: float = 0.0,
+    turn_on: int = 0,
 ) -> RateMeans:
     """Average one unbroken run of samples at one attitude into means of `samples_per_mean`, the last one shorter.
 
@@ -204,7 +210,7 @@ def from_samples(
     n_samples = np.diff(np.append(first, samples.shape[0]))
     n = first.size
     return RateMeans(
-        start=(first_index + first) / sample_rate,
+        start=stream_start + (first_index + first) / sample_rate,
         duration=n_samples / sample_rate,
         rate=np.add.reduceat(samples, first) / n_samples[:, np.newaxis],
         azimuth=np.full(n, azimuth),
@@ -212,5 +218,6 @@ def from_samples(
         tilt=np.tile(tilt, (n, 1)),
         specific_force=np.broadcast_to(specific_force, (n, 3)),
         dwell=np.full(n, dwell),
+        turn_on=np.full(n, turn_on),
         n_samples=n_samples,
     )
