@@ -20,7 +20,7 @@ CHANNEL = "can0"
 GREETING = b"< hi >"
 LONGEST_COMMAND = 200
 BUFFER = 1 << 20  #: bytes held back for a client that does not read; frames beyond are lost to it
-QUIET_S = 0.02  #: after rawmode's answer, which clients expect alone
+QUIET_S = 0.2  #: after rawmode's answer, which clients expect alone, unless they speak first
 
 _COMMAND = re.compile(r"<([^<>]*)>")
 _ERROR_CLASS = 0x20000000
@@ -140,7 +140,9 @@ class SocketcandPort:
                 self._drop(client)
                 continue
             conversation.feed(data, now_us)
-            if conversation.tap is not None and not was_raw:
+            if was_raw:
+                self._quiet_until.pop(client, None)
+            elif conversation.tap is not None:
                 self._quiet_until[client] = time.monotonic() + QUIET_S
 
     def bring_out(self) -> bool:
