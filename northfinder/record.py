@@ -8,7 +8,7 @@ s, angles in rad, rates in rad/s per count. Every row is checked against its sea
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,8 @@ from typing import Any, Self
 import msgspec
 import numpy as np
 
-from drivers.api import GyroStatus, RateBlock, StageMode, StageState
+from drivers.api import GyroStatus, RateBlock, RateCounts, StageMode, StageState
+from northfinder.block_columns import BlockColumns
 from northfinder.errors import RecordError
 from northfinder.record_schema import (
     APPLICATION_ID,
@@ -27,12 +28,15 @@ from northfinder.record_schema import (
     NAMES,
     SCHEMA_VERSION,
     Row,
+    are_sound,
     is_sound,
 )
 
 _DTYPES: dict[str, np.dtype[Any]] = {"<i4": np.dtype("<i4"), "<f4": np.dtype("<f4")}
+_ALL_STATUS = sum(GyroStatus)
 _STATUS = {int(status): status for status in (GyroStatus.OK, GyroStatus.OVERRUN)}  # the usual ones, quickly
 _ANY_INDEX = (0, 1 << 62)
+_FETCHED = 64  # rows at a time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,16 +132,25 @@ class Record:
 
         Raises RecordError at a row that is missing or altered.
         """
-        number = first
-        query = f"SELECT {NAMES[table]} FROM {table} WHERE id >= ? ORDER BY id"  # noqa: S608  # names of ours
-        with one_line(self.path, "read"):
-            for row in self._db.execute(query, (first,)):
-                if row[0] != number:
-                    raise self._damaged(f"row {number} of {table} is missing")
-                if not is_sound(table, row):
-                    raise self._damaged(f"row {number} of {table} does not match its checksum")
-                number += 1
+        for rows in self._checked(table, first, None):
+            for row in rows:
                 yield row[:-1]
+
+    def _checked(self, table: str, first: int, stop: int | None) -> Iterator[list[Row]]:
+        """Yield the rows of `table` from number `first` to before `stop`, a few at a time, each seal checked."""
+        number = first
+        query = f"SELECT {NAMES[table]} FROM {table} WHERE id >= ? AND id < ? ORDER BY id"  # noqa: S608  # names of ours
+        with one_line(self.path, "read"):
+            cursor = self._db.execute(query, (first, _ANY_INDEX[1] if stop is None else stop))
+            while rows := cursor.fetchmany(_FETCHED):
+                if [row[0] for row in rows] != list(range(number, number + len(rows))):
+                    missing = next(n for n, row in enumerate(rows, number) if row[0] != n)
+                    raise self._damaged(f"row {missing} of {table} is missing")
+                if not are_sound(table, rows):
+                    altered = next(row[0] for row in rows if not is_sound(table, row))
+                    raise self._damaged(f"row {altered} of {table} does not match its checksum")
+                number += len(rows)
+                yield rows
 
     def count(self, table: str) -> int:
         """Return how many rows `table` has, by the number of its last one."""
@@ -194,6 +207,15 @@ class Record:
         """Yield the blocks that hold the samples of a dwell, in order."""
         return self.blocks(span.first_index, span.stop_index, stream=span.stream)
 
+    def columns_of(self, span: DwellSpan) -> BlockColumns | None:
+        """Return the blocks that hold the samples of a dwell as columns, None if there are none; the quick way."""
+        first = self._first_block(span.stream, span.first_index)
+        stop = max(first, self._first_block(span.stream, span.stop_index))
+        rows = [row for rows in self._checked("block", first, stop + 1) for row in rows]
+        while rows and (rows[-1][1], rows[-1][2]) >= (span.stream, span.stop_index):
+            rows.pop()
+        return _columns(rows, self._counts(rows)) if rows else None
+
     def _first_block(self, stream: int, index: int) -> int:
         """Return the number of the first block that ends after sample `index` of `stream`: they are in that order."""
         low, high = 1, self.count("block") + 1
@@ -210,22 +232,30 @@ class Record:
                     low = middle + 1
         return low
 
+    def _counts(self, rows: Sequence[Row]) -> RateCounts:
+        """Return the counts of blocks of one form, joined. Raises RecordError if any are none."""
+        for number, _, _, n_samples, n_axes, _, _, lsb, dtype, *_, status, n_lost, data, _ in rows:
+            possible = dtype in _DTYPES and None not in {lsb, status, n_lost, data} and n_axes and n_axes > 0
+            if not possible or not 0 < len(data) == 4 * n_samples * n_axes <= MAX_BLOCK_BYTES:
+                raise self._damaged(f"row {number} of block is no block of samples")
+            if (n_axes, dtype) != (rows[0][4], rows[0][8]):
+                raise self._damaged(f"row {number} of block has samples of another form than those before")
+        data = b"".join(row[-2] for row in rows)
+        return np.frombuffer(data, _DTYPES[rows[0][8]]).reshape(-1, rows[0][4])
+
     def _block(self, row: Row) -> RateBlock:
-        number, _, first, n_samples, n_axes, device_time, arrival_time, lsb, dtype, temperature, x, y, *rest = row
-        force_x, force_y, force_z, status, n_lost, data = rest
-        possible = dtype in _DTYPES and n_axes > 0 and len(data) == 4 * n_samples * n_axes <= MAX_BLOCK_BYTES
-        if not possible or lsb is None or status < 0:
-            raise self._damaged(f"row {number} of block is no block of samples")
+        counts = self._counts([(*row, 0)])
+        _, _, first, _, _, device_time, arrival_time, lsb, _, temperature, x, y, *force, status, n_lost, _ = row
         return RateBlock(
             first_index=first,
             device_time=device_time,
             arrival_time=arrival_time,
-            counts=np.frombuffer(data, _DTYPES[dtype]).reshape(n_samples, n_axes),
+            counts=counts,
             rate_lsb=lsb,
             temperature=temperature,
             tilt=None if x is None or y is None else (x, y),
-            specific_force=None if None in {force_x, force_y, force_z} else (force_x, force_y, force_z),
-            status=_STATUS.get(status) or GyroStatus(status),
+            specific_force=None if None in force else (force[0], force[1], force[2]),
+            status=_STATUS.get(status) or GyroStatus(status & _ALL_STATUS),
             n_lost=n_lost,
         )
 
@@ -259,3 +289,21 @@ class Record:
     def fixes(self) -> list[Any]:
         """Return what was estimated, oldest first."""
         return [self._decoded(value, f"fix {number}") for number, _, value in self.rows("fix")]
+
+
+def _columns(rows: Sequence[Row], counts: RateCounts) -> BlockColumns:
+    """Return checked rows of blocks as columns."""
+    _, _, first, n_samples, _, device_time, _, lsb, _, temperature, x, y, fx, fy, fz, status, _, _, _ = zip(
+        *rows, strict=True
+    )
+    return BlockColumns(
+        first_index=np.array(first),
+        n_samples=np.array(n_samples),
+        device_time=np.array(device_time, dtype=np.float64),
+        rate_lsb=np.array(lsb),
+        temperature=np.array(temperature, dtype=np.float64),  # None becomes nan
+        tilt=np.array((x, y), dtype=np.float64).T,
+        specific_force=np.array((fx, fy, fz), dtype=np.float64).T,
+        status=np.array(status),
+        counts=counts,
+    )

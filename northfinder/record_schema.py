@@ -8,7 +8,7 @@ changed or deleted; a missing number is a lost row. docs/record.md describes eve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -149,7 +149,9 @@ def _text(value: str) -> str:
 _CASTS: dict[Kind, Callable[[Any], Any]] = {"INTEGER": _integer, "REAL": _real, "TEXT": _text, "BLOB": bytes}
 _TABLE_CASTS = {table: tuple(_CASTS[column.kind] for column in columns) for table, columns in TABLES.items()}
 _TYPES: dict[Kind, type] = {"INTEGER": int, "REAL": float, "TEXT": str, "BLOB": bytes}
-_TABLE_TYPES = {table: tuple(_TYPES[column.kind] for column in columns) for table, columns in TABLES.items()}
+_TABLE_TYPES = {
+    table: tuple({_TYPES[column.kind], type(None)} for column in columns) for table, columns in TABLES.items()
+}
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -165,22 +167,16 @@ def sealed(table: str, number: int, values: Iterable[Any]) -> Row:
     return (*row, checksum(table, row))
 
 
-_sound_types: dict[str, set[tuple[type, ...]]] = {table: set() for table in TABLES}
-
-
-def _has_types(table: str, row: Row) -> bool:
-    """Return whether the row has a value, or nothing, of its kind in every column."""
-    found = tuple(map(type, row))
-    if found in _sound_types[table]:
-        return True
-    expected = (int, *_TABLE_TYPES[table], int)
-    sound = len(found) == len(expected) and all(t in {e, type(None)} for t, e in zip(found, expected, strict=True))
-    if sound and found[0] is int:
-        _sound_types[table].add(found)
-        return True
-    return False
-
-
 def is_sound(table: str, row: Row) -> bool:
     """Return whether a row is one of this table, as it was written."""
-    return _has_types(table, row) and checksum(table, row[:-1]) == row[-1]
+    return are_sound(table, [row])
+
+
+def are_sound(table: str, rows: Sequence[Row]) -> bool:
+    """Return whether every row, of equally many values, is one of this table, as it was written."""
+    *columns, checksums = zip(*rows, strict=True)
+    if len(columns) != len(_TABLE_TYPES[table]) + 1 or set(map(type, columns[0])) != {int}:
+        return False
+    if not all(set(map(type, c)) <= allowed for c, allowed in zip(columns[1:], _TABLE_TYPES[table], strict=True)):
+        return False
+    return [checksum(table, row[:-1]) for row in rows] == list(checksums)

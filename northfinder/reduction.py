@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.api import GyroStatus, RateBlock
+from northfinder.block_columns import BlockColumns, columns_of_blocks
 from northfinder.errors import EstimateError
 from northfinder.estimation.means import RateMeans, concatenate, from_samples
 from northfinder.record import DwellSpan, Record
@@ -30,9 +32,14 @@ class Reduction:
 
     def add(self, span: DwellSpan, blocks: Iterable[RateBlock]) -> None:
         """Add a finished dwell from the blocks that hold its samples."""
+        found = list(blocks)
+        self.add_columns(span, columns_of_blocks(found) if found else None)
+
+    def add_columns(self, span: DwellSpan, columns: BlockColumns | None) -> None:
+        """Add a finished dwell from its blocks as columns, None if there are none."""
         samples_per_mean = max(1, round(MEAN_INTERVAL * span.sample_rate))
         n_found = 0
-        for run in _unbroken_runs(span, blocks):
+        for run in _unbroken_runs(span, columns):
             n_found += len(run.rate)
             if not run.fit:
                 self.n_unfit += len(run.rate)
@@ -45,9 +52,11 @@ class Reduction:
                     samples_per_mean=samples_per_mean,
                     azimuth=span.measured_azimuth,
                     elevation=span.measured_elevation,
-                    tilt=run.tilt,
+                    tilt=_mean_tilt(run.blocks),
                     specific_force=_specific_force(run, samples_per_mean),
                     dwell=span.step,
+                    stream_start=span.stream_start,
+                    turn_on=span.turn_on,
                 )
             )
         self.n_missing += span.stop_index - span.first_index - n_found
@@ -63,46 +72,31 @@ class Reduction:
 class _Run:
     first_index: int
     rate: NDArray[np.float64]
-    tilt: tuple[float, float]
-    blocks: tuple[RateBlock, ...]
+    blocks: BlockColumns
     fit: bool
 
 
-def _unbroken_runs(span: DwellSpan, blocks: Iterable[RateBlock]) -> Iterator[_Run]:
+def _unbroken_runs(span: DwellSpan, columns: BlockColumns | None) -> Iterator[_Run]:
     """Yield the dwell's samples in runs without a gap, fit and unfit ones apart."""
-    run: list[RateBlock] = []
-    for block in blocks:
-        if run and (_end(run[-1]) != block.first_index or _fit(run[-1]) != _fit(block)):
-            yield from _cut(span, run)
-            run = []
-        run.append(block)
-    if run:
-        yield from _cut(span, run)
+    if columns is None:
+        return
+    fit = (columns.status & int(UNFIT)) == 0
+    new_run = (columns.stop_index[:-1] != columns.first_index[1:]) | (fit[:-1] != fit[1:])
+    edges = [0, *(np.flatnonzero(new_run) + 1).tolist(), len(fit)]
+    for begin, end in pairwise(edges):
+        run = columns.part(begin, end)
+        origin = int(run.first_index[0])
+        first, stop = max(span.first_index, origin), min(span.stop_index, int(run.stop_index[-1]))
+        if first < stop:
+            yield _Run(first, run.rate[first - origin : stop - origin], run, bool(fit[begin]))
 
 
-def _cut(span: DwellSpan, run: list[RateBlock]) -> Iterator[_Run]:
-    """Yield what of the run lies within the dwell, if anything."""
-    begin = run[0].first_index
-    first, stop = max(span.first_index, begin), min(span.stop_index, _end(run[-1]))
-    if first < stop:
-        rate = np.concatenate([block.rate for block in run])[first - begin : stop - begin]
-        yield _Run(first, rate, _mean_tilt(run), tuple(run), _fit(run[0]))
-
-
-def _end(block: RateBlock) -> int:
-    return block.first_index + len(block.counts)
-
-
-def _fit(block: RateBlock) -> bool:
-    return not block.status & UNFIT
-
-
-def _mean_tilt(run: list[RateBlock]) -> tuple[float, float]:
+def _mean_tilt(blocks: BlockColumns) -> tuple[float, float]:
     """Return the mean of the measured tilts, zero if there are none."""
-    tilts = [block.tilt for block in run if block.tilt is not None and not block.status & GyroStatus.TILT_INVALID]
-    if not tilts:
+    valid = ((blocks.status & int(GyroStatus.TILT_INVALID)) == 0) & ~np.isnan(blocks.tilt).any(axis=1)
+    if not valid.any():
         return (0.0, 0.0)
-    x, y = np.mean(tilts, axis=0)
+    x, y = blocks.tilt[valid].mean(axis=0)
     return (float(x), float(y))
 
 
@@ -112,12 +106,12 @@ def _specific_force(run: _Run, samples_per_mean: int) -> NDArray[np.float64]:
     A mean without the middle of a block has that of the whole run; all are zero where nothing was measured.
     """
     n_means = -(-len(run.rate) // samples_per_mean)
-    measured = [block for block in run.blocks if block.specific_force is not None]
-    if not measured:
+    measured = ~np.isnan(run.blocks.specific_force).any(axis=1)
+    if not measured.any():
         return np.zeros((n_means, 3))
-    length = np.array([len(block.counts) for block in measured])
-    middle = np.array([block.first_index for block in measured]) + length / 2.0
-    force = np.array([block.specific_force for block in measured]) * length[:, np.newaxis]
+    length = run.blocks.n_samples[measured]
+    middle = run.blocks.first_index[measured] + length / 2.0
+    force = run.blocks.specific_force[measured] * length[:, np.newaxis]
     number = ((middle - run.first_index) // samples_per_mean).astype(np.int64)
     inside = (number >= 0) & (number < n_means) & (middle < run.first_index + len(run.rate))
     weight = np.bincount(number[inside], length[inside], n_means)
@@ -130,5 +124,5 @@ def reduce_record(record: Record) -> Reduction:
     """Reduce all finished dwells of a record. Raises RecordError."""
     reduction = Reduction()
     for span in record.steps():
-        reduction.add(span, record.blocks_of(span))
+        reduction.add_columns(span, record.columns_of(span))
     return reduction

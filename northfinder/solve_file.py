@@ -10,14 +10,10 @@ from typing import Any
 import msgspec
 
 from northfinder.errors import RecordError
-from northfinder.estimation.double_gyrocompass import solve_triad
-from northfinder.estimation.dwell_table import solve_dwell_table
-from northfinder.estimation.triad import static_mean
 from northfinder.record import Record
 from northfinder.record_facts import completeness, gyro_identity, record_date
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, fix_to_json, solve, supplement
-from northfinder.table_report import dwell_table_json, triad_json
 from northfinder.tables import DwellTable, StaticTriad, read_table, stated_input_axis_offset
 
 _SQLITE = b"SQLite format 3\0"
@@ -95,6 +91,12 @@ def kept_assumptions(record: Record) -> Assumptions:
 def _solve_table(
     table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float | None
 ) -> dict[str, Any]:
+    # What only tables need is dear to import, and records are solved much more often.
+    from northfinder.estimation.double_gyrocompass import solve_triad  # noqa: PLC0415
+    from northfinder.estimation.dwell_table import solve_dwell_table  # noqa: PLC0415
+    from northfinder.estimation.triad import static_mean  # noqa: PLC0415
+    from northfinder.table_report import dwell_table_json, triad_json  # noqa: PLC0415
+
     if isinstance(table, StaticTriad):
         means = [static_mean(position.name, position.rate, position.specific_force) for position in table.positions]
         return triad_json(solve_triad(means, latitude=latitude))
