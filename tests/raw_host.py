@@ -22,6 +22,7 @@ HELLO, HEARTBEAT, SELF_TEST, STREAM_START, HOME, MOVE = 0x01, 0x02, 0x05, 0x10, 
 IDENTITY, ACK, SAMPLES, STAGE_STATUS = 0x81, 0xC0, 0x40, 0x41
 NOT_HOMED, HOMING, IDLE, MOVING, STOPPING, FAULT = range(6)
 DEGREE = 36_000  #: counts
+PATIENCE = 60.0  #: s, for what comes at once on a machine that is not busy
 
 
 def frame(body: bytes) -> bytes:
@@ -119,7 +120,7 @@ class RawPort:
         self._socket: socket.socket | None = None
         if target.startswith("socket://"):
             host, port = target.removeprefix("socket://").rsplit(":", 1)
-            self._socket = socket.create_connection((host, int(port)), timeout=5)
+            self._socket = socket.create_connection((host, int(port)), timeout=PATIENCE)
             self.handle = self._socket.fileno()
         else:
             self.handle = os.open(target, os.O_RDWR | os.O_NOCTTY)
@@ -128,7 +129,7 @@ class RawPort:
         """Send all of `data`."""
         os.write(self.handle, data)
 
-    def receive(self, timeout: float = 5.0) -> list[bytes]:
+    def receive(self, timeout: float = PATIENCE) -> list[bytes]:
         """Return the bodies that arrive with the next bytes; EOFError if the line is gone, TimeoutError if none do."""
         if not select.select([self.handle], [], [], timeout)[0]:
             raise TimeoutError("nothing came")
@@ -140,7 +141,7 @@ class RawPort:
             raise EOFError("the line is gone")
         return self._decoder.feed(data)
 
-    def wait_for(self, kind: int, timeout: float = 5.0) -> bytes:
+    def wait_for(self, kind: int, timeout: float = PATIENCE) -> bytes:
         """Return the next body of that type."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
