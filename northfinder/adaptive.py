@@ -15,6 +15,7 @@ from northfinder.layouts import MEASURE_LATITUDE, PLANS
 from northfinder.plans import Conditions, candidates, filled, following_turns, time_of_turns
 from northfinder.reduction import MEAN_INTERVAL
 from northfinder.solution import Assumptions
+from northfinder.triad_plans import TRIAD_PLANS
 from northfinder.turns import Turns
 
 #: Time of a plan that fills whatever it is given, s.
@@ -123,10 +124,14 @@ def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> Ada
     searchable = assumptions.noise() is not None and wishes.dwell is None
     name = wishes.name or ("refined" if searchable else "six-position")
     _check_wishes(name, wishes, searchable=searchable)
+    _check_triad(name, wishes, assumptions)
     searched = name in PLANS and searchable and (name not in BUILT_IN or wishes.time is not None)
     time = wishes.time
     if time is None and searched:
         time = DEFAULT_TIME if wishes.until_sd is None else DEFAULT_TIME_UNTIL_SD
+
+    if name in TRIAD_PLANS and wishes.dwell is None:
+        time = wishes.time or DEFAULT_TIME
 
     def design(turns: Turns) -> Design:
         return (
@@ -135,19 +140,38 @@ def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> Ada
             else _fixed(name, time, wishes, turns)
         )
 
-    if not searched:
+    if not searched and name not in TRIAD_PLANS:
         find_cyclogram(name)  # complains now, rather than once the devices are open
     return AdaptivePlan(
-        name=name, design=design, settle=settle, time=time, until_sd=wishes.until_sd, azimuth=wishes.azimuth
+        name=name,
+        design=design,
+        settle=settle,
+        time=None if name in TRIAD_PLANS else time,  # a turn by hand may take longer, at no dwell's expense
+        until_sd=wishes.until_sd,
+        azimuth=wishes.azimuth,
     )
 
 
+def _check_triad(name: str, wishes: Wishes, assumptions: Assumptions) -> None:
+    """Raise ConfigError if too little is known, or too much asked, for a plan of a triad."""
+    if name not in TRIAD_PLANS:
+        return
+    if wishes.until_sd is not None:
+        raise ConfigError(f"the plan {name} cannot end early at a standard deviation: leave --until-sd out")
+    if name == "static" and assumptions.known().bias_sd is None:
+        raise ConfigError(
+            "the plan static takes the biases of the gyros as zero and must know how far they may be from it: "
+            "give --profile with gyro_bias_sd_dph under [errors], or turn the triad with --plan two-position"
+        )
+
+
 def _check_wishes(name: str, wishes: Wishes, *, searchable: bool) -> None:
-    if name not in PLANS and not Path(name).exists():
-        raise ConfigError(f"no plan {name!r}: expected {', '.join(PLANS)}, or a TOML file of a cyclogram")
+    known = (*PLANS, *TRIAD_PLANS)
+    if name not in known and not Path(name).exists():
+        raise ConfigError(f"no plan {name!r}: expected {', '.join(known)}, or a TOML file of a cyclogram")
     if wishes.dwell is not None and wishes.time is not None:
         raise ConfigError("a dwell and a time cannot both be given: the time says how long the dwells are")
-    if wishes.dwell is not None and name not in PLANS:
+    if wishes.dwell is not None and name not in known:
         raise ConfigError(f"the plan {name} has dwells of its own: give --time to stretch them, not --dwell")
     if name == "double" and wishes.azimuth is None:
         raise ConfigError("the plan double starts from a roughly known azimuth: give --azimuth")
@@ -158,7 +182,8 @@ def _check_wishes(name: str, wishes: Wishes, *, searchable: bool) -> None:
 
 def _fixed(name: str, time: float | None, wishes: Wishes, turns: Turns) -> Design:
     """Return a cyclogram as it stands, or stretched to the time."""
-    cyclogram: Cyclogram | None = find_cyclogram(name, dwell=wishes.dwell or _DEFAULT_DWELL)
+    dwell = wishes.dwell or _DEFAULT_DWELL
+    cyclogram: Cyclogram | None = TRIAD_PLANS[name](dwell) if name in TRIAD_PLANS else find_cyclogram(name, dwell=dwell)
     if time is not None and cyclogram is not None:
         cyclogram = filled(cyclogram, turns, time, azimuth=wishes.azimuth or 0.0)
     if cyclogram is None:

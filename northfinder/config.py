@@ -114,7 +114,7 @@ class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=Tr
     """A bench and a measurement on it."""
 
     gyro: GyroTable
-    stage: StageTable
+    stage: StageTable | None = None  #: None where the gyro stands on none
     measurement: MeasurementTable = msgspec.field(default_factory=MeasurementTable)
 
 

@@ -27,6 +27,9 @@ class Display(Protocol):
     def show(self, progress: Progress, fix: Fix | None) -> None:
         """Show it, unless it is too soon for another picture."""
 
+    def say(self, text: str) -> None:
+        """Tell the operator something that must be read."""
+
 
 class LiveDisplay:
     """A table that is drawn anew in place."""
@@ -44,6 +47,10 @@ class LiveDisplay:
             return
         self._next = now + REFRESH_PERIOD
         self._live.update(self._table(progress, fix), refresh=True)
+
+    def say(self, text: str) -> None:
+        """Print it above the table."""
+        self._live.console.print(text)
 
     def _table(self, progress: Progress, fix: Fix | None) -> Table:
         table = Table.grid(padding=(0, 2))
@@ -85,12 +92,20 @@ class PlainDisplay:
             line += "" if fix is None else f", azimuth {azimuth_text(fix)}"
         print(line, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
 
+    def say(self, text: str) -> None:
+        """Print it."""
+        print(text, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
+
 
 class SilentDisplay:
-    """Shows nothing."""
+    """Shows nothing but what must be read."""
 
     def show(self, progress: Progress, fix: Fix | None) -> None:
         """Show nothing."""
+
+    def say(self, text: str) -> None:
+        """Print it."""
+        print(text, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
 
 
 class DisplayContext(AbstractContextManager[Display]):

@@ -21,17 +21,20 @@ import msgspec
 
 from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import open_gyro, open_stage
+from drivers.fixed_mount import FixedMount
 from drivers.transport.clock import SystemClock
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.calibration import Calibration, checked, read_calibration
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
+from northfinder.cli.operator import TerminalOperator
 from northfinder.cli.options import estimation_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.config import Config, GyroTable, MeasurementTable, StageTable, read_config
 from northfinder.errors import ConfigError
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
+from northfinder.triad_plans import TRIAD_PLANS, fit_for
 
 Device = TypeVar("Device", Gyro, Stage)
 
@@ -46,7 +49,8 @@ STARTED = time.monotonic()
 @click.option(
     "--plan",
     metavar="NAME|FILE",
-    help="refined (default with a profile), double, drift-balanced, four-position, six-position, or a TOML file.",
+    help="refined (default with a profile), double, drift-balanced, four-position, six-position, or a TOML file; "
+    "of a triad without a stage: static, two-position.",
 )
 @click.option(
     "--time", "time_s", type=click.FloatRange(min=10, max=3600), metavar="S", help="From the first slew to the end."
@@ -60,6 +64,10 @@ STARTED = time.monotonic()
 )
 @click.option("--azimuth", "azimuth_deg", type=float, metavar="DEG", help="Roughly known azimuth, for the plan double.")
 @click.option("--dwell", "dwell_s", type=click.FloatRange(min=1), metavar="S", help="Dwell of six or four positions.")
+@click.option(
+    "--turn-sd", "turn_sd_deg", type=click.FloatRange(min=0), default=0.5, show_default=True, metavar="DEG",
+    help="Standard deviation of a turn by hand.",
+)  # fmt: skip
 @click.option(
     "--repeat", type=click.IntRange(min=1), default=1, metavar="N", help="Measure N times, and compare the fixes."
 )
@@ -88,11 +96,11 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
     # Whatever can be wrong with the command is found before an emulator is started or a port is opened.
     bench = options.bench()
     truth = None if bench else options.truth()
-    config = bench or Config(
-        gyro=GyroTable(address="", profile=None if truth is None else truth.profile), stage=StageTable(address="")
-    )
+    config = bench or options.emulated_bench()
     assumptions = options.assumptions(config)
-    plan = make_plan(options.wishes(config.measurement), assumptions, settle=config.measurement.settle_s)
+    wishes = options.wishes(config.measurement)
+    plan = make_plan(wishes, assumptions, settle=config.measurement.settle_s)
+    _check_stage(config, plan.name)
     clock = SystemClock()
     with ExitStack() as stack:
         if truth is not None:
@@ -103,8 +111,8 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
         for _ in range(options.repeat):
             begun = time.monotonic() if results else STARTED
             measurement = Measurement(
-                open_gyro=partial(_open_gyro, config.gyro, clock, assumptions.calibration),
-                open_stage=partial(_open_stage, config.stage, clock),
+                open_gyro=partial(_open_gyro, config.gyro, clock, assumptions.calibration, plan.name),
+                open_stage=_stage_opener(config.stage, clock, plan.name, display.say),
                 plan=plan,
                 settle=config.measurement.settle_s,
                 assumptions=assumptions,
@@ -130,6 +138,7 @@ class Options:
     until_sd_deg: float | None
     azimuth_deg: float | None
     dwell_s: float | None
+    turn_sd_deg: float
     repeat: int
     out: Path
     quiet: bool
@@ -160,9 +169,21 @@ class Options:
             return read_config(self.config_file)
         if self.gyro_address is None and self.stage_address is None:
             return None
-        if self.gyro_address is None or self.stage_address is None:
-            raise ConfigError("--gyro and --stage go together: one of them is missing")
-        return Config(gyro=GyroTable(address=self.gyro_address), stage=StageTable(address=self.stage_address))
+        if self.gyro_address is None:
+            raise ConfigError("--stage goes with --gyro, and that is missing")
+        stage = None if self.stage_address is None else StageTable(address=self.stage_address)
+        return Config(gyro=GyroTable(address=self.gyro_address), stage=stage)
+
+    def emulated_bench(self) -> Config:
+        """Return the bench to emulate, without addresses yet; at rest there is no stage on it."""
+        stage = None if self.plan == "static" else StageTable(address="")
+        return Config(gyro=GyroTable(address="", profile=self._emulated_profile()), stage=stage)
+
+    def _emulated_profile(self) -> str:
+        """Return the profile asked for, else one that the plan can use, else that of the kind of gyro."""
+        if self.sim_profile is None and self.sim_gyro == "native" and self.plan in TRIAD_PLANS:
+            return "triad"
+        return self.sim_profile or _profile_of(self.sim_gyro)
 
     def truth(self) -> SimulationOptions:
         """Return the world to emulate; without a seed another one each time. Raises ConfigError."""
@@ -172,7 +193,7 @@ class Options:
             stage=self.sim_stage,
             azimuth_deg=self.sim_azimuth,
             latitude_deg=self.sim_latitude,
-            profile=self.sim_profile or _profile_of(self.sim_gyro),
+            profile=self._emulated_profile(),
             seed=secrets.randbits(32) if self.seed is None else self.seed,
             speed=self.speed,
             bus=self.bus or "",
@@ -190,7 +211,11 @@ class Options:
             g_drift_dph=self.g_drift_dph,
             method=self.method,
             calibration=calibration,
+            turn_sd_deg=self.turn_sd_deg if config.stage is None and self._plan(config) == "two-position" else 0.0,
         )
+
+    def _plan(self, config: Config) -> str | None:
+        return self.plan or config.measurement.plan
 
     def wishes(self, table: MeasurementTable) -> Wishes:
         """Return what is asked of the plan, by the options or else by the configuration."""
@@ -247,13 +272,27 @@ def _show(results: list[dict[str, Any]], truth: tuple[float, float] | None, *, a
         print_campaign(summary)
 
 
-def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None) -> Gyro:
-    """Open the gyro; connecting it then checks that the calibration is its own and still valid."""
-    return checked(_opened(open_gyro, table.address, clock, **table.driver_options()), calibration, _today())
+def _check_stage(config: Config, plan: str) -> None:
+    """Raise ConfigError if the plan needs a stage, and there is none."""
+    if config.stage is None and plan not in TRIAD_PLANS:
+        raise ConfigError(
+            f"the plan {plan} turns the gyro on a stage: give --stage, or [stage] in the bench's file; "
+            f"without one a triad has the plans {' and '.join(TRIAD_PLANS)}"
+        )
 
 
-def _open_stage(table: StageTable, clock: Clock) -> Stage:
-    return _opened(open_stage, table.address, clock, limits=table.limits(), **table.driver_options())
+def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None, plan: str) -> Gyro:
+    """Open the gyro; connecting it checks that it has the axes for the plan, and that the calibration is its own."""
+    gyro: Gyro = _opened(open_gyro, table.address, clock, **table.driver_options())
+    return fit_for(checked(gyro, calibration, _today()), plan)
+
+
+def _stage_opener(table: StageTable | None, clock: Clock, plan: str, say: Callable[[str], None]) -> Callable[[], Stage]:
+    """Return what opens the stage, or what stands for it; raises ConfigError if that takes a terminal."""
+    if table is not None:
+        return partial(_opened, open_stage, table.address, clock, limits=table.limits(), **table.driver_options())
+    operator = TerminalOperator(clock, say) if plan == "two-position" else None
+    return lambda: FixedMount(clock, operator)
 
 
 def _today() -> date:
@@ -274,7 +313,7 @@ def _emulated(config: Config, emulator: EmulatorProcess) -> Config:
     return msgspec.structs.replace(
         config,
         gyro=msgspec.structs.replace(config.gyro, address=addresses["gyro"]),
-        stage=msgspec.structs.replace(config.stage, address=addresses["stage"]),
+        stage=None if config.stage is None else msgspec.structs.replace(config.stage, address=addresses["stage"]),
     )
 
 

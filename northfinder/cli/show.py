@@ -34,7 +34,8 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
         table.add_row("latitude", f"[bold]{_with_sd(result['latitude_deg'], result['latitude_sd_deg'])}[/bold]")
     if truth is not None:
         table.add_row("truth", f"azimuth {truth[0]:g} deg, latitude {truth[1]:g} deg, in the emulator")
-    table.add_row("bias", f"{result['bias_dph']:.3f} deg/h" if isinstance(result["bias_dph"], float) else "")
+    biases = result["bias_dph"] if isinstance(result["bias_dph"], list) else [result["bias_dph"]]
+    table.add_row("bias", ", ".join(f"{bias:.3f}" for bias in biases) + " deg/h")
     if result["scale_factor"] is not None:
         table.add_row("scale factor", f"{result['scale_factor']:.4f} ± {result['scale_factor_sd']:.4f}")
     for row in _notes(result):
@@ -57,6 +58,10 @@ def _notes(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "left out", f"{result['n_rejected']} disturbed seconds"
     if result["rescaled_by"] > 1:
         yield "widened", f"residuals are larger than usual: the ± are widened {result['rescaled_by']:.2f} times"
+    if "levelling" in result:
+        tilt = result["levelling"]
+        x_y = f"{tilt['tilt_x_deg']:.4f}, {tilt['tilt_y_deg']:.4f} ± {tilt['tilt_sd_deg']:.4f} deg"
+        yield "tilt", f"{x_y}, by the accelerometers"
     if "budget" in result:
         yield "uncertainty", f"of the azimuth, the largest parts: {largest(result['budget'])} deg"
     if "calibration" in result:

@@ -106,7 +106,8 @@ def _levelling(found: Array, covariance: Array, n_attitudes: int) -> Levelling:
             f"{math.degrees(LARGEST_TILT):.0f}: mount the triad with its third axis down"
         )
     per_force = angle / across if across else 1.0 / norm
-    tilt_sd = math.sqrt(max(covariance[0, 0], covariance[1, 1])) / norm
+    across_variance = max(float(covariance[0, 0]), float(covariance[1, 1]))
+    tilt_sd = math.sqrt(across_variance + angle**2 * float(covariance[2, 2])) / norm
     return Levelling(
         tilt=(-per_force * float(force[0]), -per_force * float(force[1])),
         tilt_sd=tilt_sd,
