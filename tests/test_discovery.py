@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import os
+import random
 import select
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from typing import Self
 
 import pytest
 
-from drivers.discovery import GYROS, STAGES, identify, open_gyro, open_stage
+from drivers.api import DeviceIdentity
+from drivers.discovery import GYROS, STAGES, identify, open_gyro, open_stage, recognisers
 from drivers.errors import DeviceTimeoutError, LinkError
 from drivers.native import NativeGyro, NativeStage
+from drivers.recognition import Recogniser
 from drivers.transport.clock import SystemClock
 from sim_device.bench import SimBench
+
+if sys.platform != "win32":
+    import tty
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 PATIENCE = 10.0  # s
@@ -117,6 +125,88 @@ def test_a_silent_port_is_told() -> None:
     stage.close()
     os.close(master)
     os.close(slave)
+
+
+@dataclass(frozen=True)
+class FakeRecogniser:
+    """Knows an instrument by one word."""
+
+    name: str
+    word: bytes
+    question: bytes = b""
+    baudrates: tuple[int, ...] = (9600,)
+
+    def recognise(self, heard: bytes) -> DeviceIdentity | None:
+        """Return it if its word was heard."""
+        return DeviceIdentity(kind="gyro", model=self.name, serial_number="") if self.word in heard else None
+
+
+class Chatty:
+    """A device on a pseudo-terminal that says a word again and again, or only when it is asked; notes what it hears."""
+
+    def __init__(self, word: bytes, *, asked: bytes = b"") -> None:
+        self.heard = b""
+        self.master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._serve, args=(word, asked))
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        """End it."""
+        self._done.set()
+        self._thread.join(PATIENCE)
+        os.close(self._slave)
+        os.close(self.master)
+
+    def _serve(self, word: bytes, asked: bytes) -> None:
+        while not self._done.is_set():
+            ready, _, _ = select.select([self.master], [], [], 0.005)
+            data = os.read(self.master, 4096) if ready else b""
+            self.heard += data
+            if not asked or (data and asked in self.heard):
+                os.write(self.master, word)
+
+
+@posix
+def test_whoever_talks_is_not_asked() -> None:
+    """An instrument that streams is known by listening alone: not a byte is sent to it."""
+    known = (FakeRecogniser("talker", b"abc"), FakeRecogniser("asker", b"never", question=b"who?"))
+    with Chatty(b"xabc") as device:
+        found = identify(device.path, SystemClock(), known=known)
+        assert (found.address, found.baudrate) == (f"talker:{device.path}", 9600)
+        assert device.heard == b""
+
+
+@posix
+def test_whoever_waits_to_be_asked_is_asked_last() -> None:
+    """Only after all baud rates were listened at; its answer then names it."""
+    known = (
+        FakeRecogniser("talker", b"abc", baudrates=(19200, 9600)),
+        FakeRecogniser("asker", b"me", question=b"who?"),
+    )
+    with Chatty(b"me", asked=b"who?") as device:
+        found = identify(device.path, SystemClock(), known=known)
+        assert found.address == f"asker:{device.path}"
+        assert device.heard == b"who?"
+
+
+@pytest.mark.parametrize("known", recognisers(), ids=lambda each: each.name)
+def test_every_question_is_harmless_to_the_others(known: Recogniser) -> None:
+    """A question ends no command of another instrument; the name is a driver's; random bytes are nobody's."""
+    drivers = {entry.name for group in (GYROS, STAGES) for entry in entry_points(group=group)}
+    assert known.name in drivers
+    assert known.baudrates
+    text = known.question.isascii() and known.question.rstrip(b"\r\n").decode().isprintable()
+    assert text or known.question.count(b"\r") <= 1
+    noise = random.Random(5).randbytes(20_000)
+    assert known.recognise(noise) is None
+    assert known.recognise(b"") is None
 
 
 def test_a_port_that_cannot_be_opened_is_told() -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from drivers.api import Clock, DeviceIdentity, Gyro, Stage, StageLimits
+from drivers.api import Clock, Gyro, Stage, StageLimits
 from drivers.native.gyro import NativeGyro
-from drivers.native.session import Session
 from drivers.native.stage import NativeStage
 from drivers.transport.serial_port import DEFAULT_BAUDRATE, open_link
 
-__all__ = ["NativeGyro", "NativeStage", "identify", "open_gyro", "open_stage"]
+__all__ = ["NativeGyro", "NativeStage", "open_gyro", "open_stage"]
 
 
 def open_gyro(
@@ -45,20 +44,3 @@ def open_stage(
         If the port cannot be opened.
     """
     return NativeStage(open_link(address, clock, baudrate=baudrate), clock, limits=limits)
-
-
-def identify(address: str, clock: Clock, *, baudrate: int = DEFAULT_BAUDRATE) -> DeviceIdentity:
-    """Ask who is behind a port, and release it. Sets nothing in motion; a moving stage comes to rest.
-
-    Raises
-    ------
-    LinkError
-        If the port cannot be opened.
-    DeviceTimeoutError, ProtocolError
-        If no native device of this version answers.
-    """
-    session = Session(open_link(address, clock, baudrate=baudrate), clock, kind=None)
-    try:
-        return session.open(attempts=3)
-    finally:
-        session.close()

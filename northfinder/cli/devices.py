@@ -17,7 +17,9 @@ from northfinder.text import printable
 @click.argument("ports", nargs=-1, metavar="[PORT]...")
 @click.option("--json", "as_json", is_flag=True, help="One JSON array on standard output.")
 def command(ports: tuple[str, ...], *, as_json: bool) -> None:
-    """List the serial ports, or those named, and identify what answers on each. Moves nothing.
+    """List the serial ports, or those named, and identify what is behind each: listens first, then asks.
+
+    Moves nothing and changes no setting; a silent port takes some seconds, for every baud rate is tried.
 
     \b
       northfinder devices
@@ -34,9 +36,10 @@ def command(ports: tuple[str, ...], *, as_json: bool) -> None:
 
 
 def _table(found: list[Identification]) -> Table:
-    table = Table("address", "kind", "model", "serial number", "remark")
+    table = Table("address", "baud rate", "kind", "model", "serial number", "remark")
     for each in found:
         identity = each.identity
         who = ("", "", "") if identity is None else (identity.kind, identity.model, identity.serial_number)
-        table.add_row(*(printable(cell) for cell in (each.address, *who, each.remark)))
+        baudrate = "" if each.baudrate is None else str(each.baudrate)
+        table.add_row(*(printable(cell) for cell in (each.address, baudrate, *who, each.remark)))
     return table
