@@ -404,7 +404,8 @@ class Sequencer:
             state = self._service_stage()
             if state.mode is StageMode.FAULT:
                 raise DeviceFaultError(f"the stage reports {state.fault}; it stays stopped until the fault is cleared")
-            blocks = [part for block in gyro.read() for part in parts(block, gyro.sample_rate)] if stream else []
+            arrived = gyro.read()  # before the stream, too: what a gyro sends unasked must not fill its line
+            blocks = [part for block in arrived for part in parts(block, gyro.sample_rate)] if stream else []
             if blocks and not self._next_index:
                 self._place = self._placed(blocks[0])
             for block in blocks:

@@ -69,6 +69,8 @@ class SimGyroBoard(GyroBoard):
         self._stage = stage
         self._tilt_rng = tilt_rng
         self._accelerometer_rng = accelerometer_rng
+        self._stood: tuple[float, ...] = ()  # where the stage last stood when the vertical was looked for
+        self._up = np.zeros(3)
         self._epoch_us = epoch_us
         self._start_us = 0
         self._next = 0
@@ -155,12 +157,14 @@ class SimGyroBoard(GyroBoard):
         middle_us = int(
             self._epoch_us + self.newest_block_us + 5e8 * self.newest_block_samples / self.sample_rate_millihz
         )
-        azimuth, elevation = (axis.true_angle(middle_us) for axis in self._stage.axes)
-        up = project(self.gyro.site, np.eye(3), azimuth, elevation).up[0]
+        stands = tuple(axis.true_angle(middle_us) for axis in self._stage.axes)
+        if stands != self._stood:
+            self._stood = stands
+            self._up = project(self.gyro.site, np.eye(3), stands[0], stands[1]).up[0]
         noise = profile.velocity_random_walk_mg_per_sqrt_hz * math.sqrt(
             self.sample_rate_millihz / 1000 / max(1, self.newest_block_samples)
         )
-        read = up * 1e3 + profile.bias_mg + noise * self._accelerometer_rng.standard_normal(3)
+        read = self._up * 1e3 + profile.bias_mg + noise * self._accelerometer_rng.standard_normal(3)
         x, y, z = np.rint(read * 1e3)
         return int(x), int(y), int(z)
 
