@@ -223,6 +223,8 @@ class Gyro(Protocol):
     def read(self) -> list[RateBlock]:
         """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.
 
+        Before `start` there are none, but what a gyro sends unasked is taken off its line.
+
         Raises LinkError if the link is lost, DeviceTimeoutError if a started stream has fallen silent.
         """
 
