@@ -216,6 +216,18 @@ class Record:
             rows.pop()
         return _columns(rows, self._counts(rows)) if rows else None
 
+    def column_batches(self, n_blocks: int) -> Iterator[tuple[int, BlockColumns]]:
+        """Yield (stream, blocks as columns) of the whole record in order, `n_blocks` at a time where it can."""
+        batch: list[Row] = []
+        for rows in self._checked("block", 1, None):
+            for row in rows:
+                if batch and (row[1] != batch[0][1] or len(batch) >= n_blocks):
+                    yield batch[0][1], _columns(batch, self._counts(batch))
+                    batch = []
+                batch.append(row)
+        if batch:
+            yield batch[0][1], _columns(batch, self._counts(batch))
+
     def _first_block(self, stream: int, index: int) -> int:
         """Return the number of the first block that ends after sample `index` of `stream`: they are in that order."""
         low, high = 1, self.count("block") + 1

@@ -67,6 +67,16 @@ def _open(path: Path, doing: str, *, create_tables: bool) -> tuple[sqlite3.Conne
     return db, lock
 
 
+def finish(db: sqlite3.Connection) -> None:
+    """Make one file of the record, unless somebody reads it right now: it is complete as it is."""
+    db.execute(f"PRAGMA busy_timeout = {round(1000 * TIDY_TIMEOUT)}")
+    try:
+        db.execute("PRAGMA journal_mode = DELETE")
+    except sqlite3.OperationalError as error:
+        if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+            raise
+
+
 def _sync_folder(folder: Path) -> None:
     """Make the new name in `folder` durable, where the system can."""
     with suppress(OSError):
@@ -165,7 +175,7 @@ class Writer(threading.Thread):
     def _finish(self) -> None:
         try:
             if self._error is None:
-                self._tidy()
+                finish(self._db)
                 self._db.close()
             else:
                 self._leave()
@@ -173,15 +183,6 @@ class Writer(threading.Thread):
             self._error = self._error or str(error)
         finally:
             self._lock.release()
-
-    def _tidy(self) -> None:
-        """Make one file of the record, unless somebody reads it right now: it is complete as it is."""
-        self._db.execute(f"PRAGMA busy_timeout = {round(1000 * TIDY_TIMEOUT)}")
-        try:
-            self._db.execute("PRAGMA journal_mode = DELETE")
-        except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
-                raise
 
     def _leave(self) -> None:
         """Close the files as they are: a reader that stays to the last keeps SQLite from copying and syncing more."""

@@ -5,6 +5,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +98,7 @@ def test_counts_survive_bit_for_bit(tmp_path_factory: pytest.TempPathFactory, co
 def test_what_has_arrived_is_handed_over_in_time(tmp_path: Path) -> None:
     """Another process sees a block as soon as the write period has passed, the record still open."""
     path = tmp_path / "north.sqlite"
-    instants = iter([0.0, WRITE_PERIOD / 2, WRITE_PERIOD, WRITE_PERIOD, WRITE_PERIOD])
+    instants = chain([0.0, WRITE_PERIOD / 2, WRITE_PERIOD], repeat(WRITE_PERIOD))
     with Recorder(path, lambda: next(instants)) as recorder:
         recorder.add_block(block(0))
         with Record(path) as record:

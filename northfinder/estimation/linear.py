@@ -92,7 +92,7 @@ def build_design(means: RateMeans, drift: Drift, *, bias_known: bool = False) ->
 def _of_turn_ons(means: RateMeans) -> Array:
     """Return a column of ones for each turn-on of the gyro, zero in the rows of the others."""
     turn_ons = np.unique(means.turn_on)
-    return (means.turn_on[:, np.newaxis] == turn_ons).astype(np.float64)
+    return np.asarray(means.turn_on[:, np.newaxis] == turn_ons, dtype=np.float64)
 
 
 def per_dwell(design: Design) -> Design | None:

@@ -1,0 +1,45 @@
+"""``northfinder check``: whether a record is sound."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from northfinder.cli import EXIT_RECORD
+from northfinder.cli.show import print_json
+from northfinder.record_check import Examination, examine
+from northfinder.text import printable
+
+
+@click.command("check")
+@click.argument("records", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RECORD...")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
+def command(*, records: tuple[Path, ...], as_json: bool) -> int:
+    """Check the file, the seal of every row, missing rows and gaps in the samples of each RECORD.
+
+    Ends with exit code 0 if all are sound, 5 if any is damaged. Samples that never came are no damage.
+
+    \b
+      northfinder check records/*.sqlite
+    """  # noqa: D301  # \b is click's mark to keep these lines as they are
+    found = {str(path): examine(path) for path in records}
+    if as_json:
+        print_json({"records": [{"record": path, "sound": each.sound, "found": each} for path, each in found.items()]})
+    else:
+        for path, each in found.items():
+            sys.stdout.write("".join(f"{printable(line, max_length=1000)}\n" for line in _lines(path, each)))
+    return 0 if all(each.sound for each in found.values()) else EXIT_RECORD
+
+
+def _lines(path: str, found: Examination) -> list[str]:
+    """Return what there is to say of one record."""
+    verdict = "sound" if found.sound else "DAMAGED: northfinder recover saves what is left"
+    never = f", {found.n_missing} never came" if found.n_missing else ""
+    return [
+        f"{path}: {verdict}",
+        f"  {found.n_rows} rows as they were written, {found.n_samples} samples{never}",
+        *(f"  damage: {sentence}" for sentence in found.damage),
+        *(f"  note: {sentence}" for sentence in found.notes),
+    ]

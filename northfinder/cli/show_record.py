@@ -1,0 +1,96 @@
+"""``northfinder show``: all of a record but its samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from northfinder.cli.records import utc_text
+from northfinder.cli.show import print_json
+from northfinder.record_summary import page
+from northfinder.text import printable
+
+_MAX_EVENTS = 200
+
+
+@click.command("show")
+@click.argument("record", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output, with all that there is.")
+def command(*, record: Path, as_json: bool) -> None:
+    """Show what RECORD holds: devices, plan, steps, events, notes and fix.
+
+    \b
+      northfinder show records/north-20260101T120000.000000Z.sqlite
+    """  # noqa: D301  # \b is click's mark to keep these lines as they are
+    found = page(record)
+    if as_json:
+        print_json(found)
+        return
+    console = Console()
+    console.print(_facts(found))
+    if found["step_list"]:
+        console.print(_steps(found))
+    console.print(_events(found))
+
+
+def _safe(value: object) -> str:
+    return escape(printable(str(value)))
+
+
+def _facts(found: Mapping[str, Any]) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_row("record", _safe(found["record"]))
+    table.add_row("state", f"{found['state']}, {_safe(found['steps'])}")
+    if found["started_utc_s"] is not None:
+        table.add_row("begun", f"{utc_text(found['started_utc_s'])} UTC")
+    for kind, device in _devices(found["meta"].get("identities")):
+        table.add_row(_safe(kind), _safe(device))
+    table.add_row("plan", _safe(found["plan"] or ""))
+    table.add_row("software", _safe(found["meta"].get("northfinder") or ""))
+    table.add_row("streams", f"{len(found['streams'])}, {found['n_blocks']} blocks of samples")
+    if found["azimuth_deg"] is not None:
+        table.add_row("azimuth", f"{found['azimuth_deg']:.3f} ± {found['azimuth_sd_deg']:.3f} deg")
+    if found["latitude_deg"] is not None:
+        table.add_row("latitude", f"{found['latitude_deg']:.3f} ± {found['latitude_sd_deg']:.3f} deg")
+    return table
+
+
+def _devices(identities: object) -> list[tuple[str, str]]:
+    if not isinstance(identities, dict):
+        return []
+    names = ("model", "serial_number", "firmware_version", "protocol")
+    return [
+        (kind, " ".join(str(device[name]) for name in names if device.get(name)))
+        for kind, device in identities.items()
+        if isinstance(device, dict)
+    ]
+
+
+def _steps(found: Mapping[str, Any]) -> Table:
+    table = Table("step", "position", "azimuth, deg", "elevation, deg", "seconds", "stream", box=SIMPLE)
+    for span in found["step_list"]:
+        seconds = (span.stop_index - span.first_index) / span.sample_rate if span.sample_rate else math.nan
+        angles = (math.degrees(span.measured_azimuth), math.degrees(span.measured_elevation))
+        table.add_row(
+            str(span.step + 1), _safe(span.name), f"{angles[0]:.4f}", f"{angles[1]:.4f}", f"{seconds:.1f}",
+            str(span.stream),
+        )  # fmt: skip
+    return table
+
+
+def _events(found: Mapping[str, Any]) -> Table:
+    table = Table("UTC", "event", "", box=SIMPLE)
+    told = [event for event in found["events"] if event["kind"] != "state"]
+    for event in told[:_MAX_EVENTS]:
+        table.add_row(utc_text(event["utc_s"]), _safe(event["kind"]), escape(printable(event["detail"])))
+    if len(told) > _MAX_EVENTS:
+        table.add_row("", f"and {len(told) - _MAX_EVENTS} more", "")
+    return table

@@ -1,0 +1,131 @@
+"""A torn or damaged record to a new one that holds every sound row; the original is only read."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import msgspec
+
+from northfinder.errors import RecordError
+from northfinder.record_pages import scan
+from northfinder.record_schema import INSERT, NAMES, SCHEMA, TABLES, sealed
+from northfinder.record_writer import create, finish
+
+#: Rows written at a time.
+_BATCH = 500
+#: Runs of lost rows that are named one by one.
+_MAX_NAMED = 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Salvage:
+    """What was found in a damaged record, and what was not."""
+
+    found: dict[str, int]  #: rows by table
+    lost: dict[str, tuple[tuple[int, int], ...]]  #: first and last number of each run of missing rows, by table
+    closed: bool  #: whether the record was closed, so that rows lost at its end are known too
+
+    @property
+    def n_lost(self) -> int:
+        """How many rows are known to be lost."""
+        return sum(last - first + 1 for runs in self.lost.values() for first, last in runs)
+
+    def sentences(self) -> list[str]:
+        """Return what there is to say, a sentence each."""
+        said = [f"{number} rows of {table} saved" for table, number in self.found.items() if number]
+        for table, runs in self.lost.items():
+            n = sum(last - first + 1 for first, last in runs)
+            named = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in runs[:_MAX_NAMED])
+            more = ", …" if len(runs) > _MAX_NAMED else ""
+            said.append(f"{n} rows of {table} lost: {named}{more}")
+        if not self.lost:
+            said.append("no row is missing")
+        if not self.closed:
+            said.append("the record was not closed: what came in its last 0.1 s may be missing")
+        return said
+
+
+def recover(path: Path, out: Path) -> Salvage:
+    """Write all sound rows of the record at `path`, and of the log beside it, to a new record `out`.
+
+    Rows are numbered anew, without gaps; an event says what is missing. Raises RecordError if `path` cannot be read or
+    holds no row of a record, or `out` exists.
+    """
+    if not path.is_file():
+        raise RecordError(f"no record {path}: expected a file")
+    try:
+        with closing(sqlite3.connect("", isolation_level=None)) as sorter:  # a temporary file, if it grows large
+            _collect(path, sorter)
+            salvage = _tally(sorter)
+            if not any(salvage.found.values()):
+                raise RecordError(f"{path} holds no row of a record")
+            _write(sorter, out, [f"from {path.name}", *salvage.sentences()])
+    except sqlite3.Error as error:
+        raise RecordError(f"{path} cannot be recovered to {out}: {error}") from error
+    return salvage
+
+
+def _collect(path: Path, sorter: sqlite3.Connection) -> None:
+    sorter.executescript(SCHEMA)
+    sorter.execute("BEGIN")
+    for table, row in scan(path):
+        sorter.execute(INSERT[table].replace("INSERT", "INSERT OR IGNORE", 1), row)
+    sorter.execute("COMMIT")
+
+
+def _tally(sorter: sqlite3.Connection) -> Salvage:
+    counts = closing_counts(row[2] for row in sorter.execute("SELECT * FROM meta WHERE key = 'closed' ORDER BY id"))
+    found, lost = {}, {}
+    for table in TABLES:
+        numbers = (row[0] for row in sorter.execute(f"SELECT id FROM {table} ORDER BY id"))  # noqa: S608  # names of ours
+        found[table], runs = _missing(numbers, (counts or {}).get(table, 0))
+        if runs:
+            lost[table] = runs
+    return Salvage(found=found, lost=lost, closed=counts is not None)
+
+
+def closing_counts(values: Iterator[str]) -> dict[str, int] | None:
+    """Return how many rows each table had when the record was closed last, None if it never was."""
+    newest = None
+    for value in values:
+        try:
+            newest = msgspec.json.decode(value, type=dict[str, int] | None)
+        except (msgspec.MsgspecError, RecursionError):
+            newest = None
+    return newest
+
+
+def _missing(numbers: Iterator[int], n_expected: int) -> tuple[int, tuple[tuple[int, int], ...]]:
+    """Return how many numbers there are, and the runs that are missing among 1, 2, ... up to `n_expected` at least."""
+    found, previous, runs = 0, 0, []
+    for number in numbers:
+        if number > previous + 1:
+            runs.append((previous + 1, number - 1))
+        found, previous = found + 1, number
+    if previous < n_expected:
+        runs.append((previous + 1, n_expected))
+    return found, tuple(runs)
+
+
+def _write(sorter: sqlite3.Connection, out: Path, sentences: list[str]) -> None:
+    db, lock = create(out)
+    try:
+        for table in TABLES:
+            numbered = enumerate(sorter.execute(f"SELECT {NAMES[table]} FROM {table} ORDER BY id"), 1)  # noqa: S608
+            rows = (sealed(table, number, row[1:-1]) for number, row in numbered)
+            while batch := list(islice(rows, _BATCH)):
+                db.execute("BEGIN")
+                db.executemany(INSERT[table], batch)
+                db.execute("COMMIT")
+        number = db.execute("SELECT count(*) + 1 FROM event").fetchone()[0]
+        time = db.execute("SELECT max(time) FROM event").fetchone()[0] or 0.0
+        db.execute(INSERT["event"], sealed("event", number, (0, time, "recovered", "; ".join(sentences))))
+        finish(db)
+    finally:
+        db.close()
+        lock.release()
