@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers.protocol.sample_index import CounterError, SampleIndex, cut
+from drivers.protocol.sample_index import CounterError, Numbered, Part, SampleIndex, parts
 
 RATES = (125, 250, 500, 1000, 2000)
 
@@ -104,8 +104,15 @@ def test_an_impossible_counter() -> None:
         numbering.number(np.array([57], np.uint8), 1.1)
 
 
-def test_cut() -> None:
-    """Blocks end at gaps, at changes of status, and when they are long enough."""
-    index = np.array([0, 1, 2, 3, 4, 7, 8, 9])
+def test_parts() -> None:
+    """Blocks end at gaps, at changes of status, and when they are long enough; each knows what is missing before it."""
+    numbered = Numbered(np.array([2, 3, 4, 5, 6, 9, 10, 11]), unsure=5)
     status = np.array([0, 0, 0, 0, 0, 0, 0, 4], np.uint8)
-    assert cut(index, status, longest=3) == [slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 8)]
+    assert parts(numbered, status, expected=1, longest=3) == [
+        Part(slice(0, 3), 2, 1, unsure=False),
+        Part(slice(3, 5), 5, 0, unsure=False),
+        Part(slice(5, 7), 9, 2, unsure=True),
+        Part(slice(7, 8), 11, 0, unsure=False),
+    ]
+    kept = numbered.only(np.array([True, True, False, True, True, False, True, True]))
+    assert (kept.index.tolist(), kept.unsure) == ([2, 3, 5, 6, 10, 11], 4)

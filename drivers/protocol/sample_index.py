@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 _HISTORY = 1.0  # s, before the pace is known
 _PACE_TOLERANCE = 0.05  # of samples against the host's clock
+_SLACK = 0.15  # of a turn, for jitter and drift
 _PATIENCE = 1.0  # s for which samples have to come late before some are held to be missing
 _DRIFT = 2e-4  # by which the host's and the gyro's clocks may differ
 
@@ -28,7 +29,12 @@ class Numbered:
     """Samples with their index."""
 
     index: NDArray[np.int64]  #: rising, shape (n,)
-    unsure: int | None = None  #: which sample follows a gap whose length does not rest on the counter alone
+    unsure: int | None = None  #: which of them follows a gap whose length does not rest on the counter alone
+
+    def only(self, kept: NDArray[np.bool_]) -> Numbered:
+        """Return those of the samples that are kept, shape (n,)."""
+        unsure = None if self.unsure is None else int(np.count_nonzero(kept[: self.unsure]))
+        return Numbered(self.index[kept], unsure)
 
 
 class SampleIndex:
@@ -114,7 +120,7 @@ class SampleIndex:
         if not self._keeps_pace():
             return 0
         late = (now - self._offset) * self._rate - (newest + 1)
-        turns = int(late / self._wrap + 0.5)
+        turns = int(late / self._wrap + _SLACK)  # never early: what counts as late is held against the least delay seen
         if turns <= 0:
             self._late_since = None
             return 0
@@ -134,12 +140,38 @@ class SampleIndex:
         return self._paced
 
 
-def cut(index: NDArray[np.int64], status: NDArray[np.integer], *, longest: int) -> list[slice]:
-    """Return the runs of consecutive samples of equal status, none longer than `longest`."""
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Consecutive samples of equal status."""
+
+    where: slice  #: among those that were numbered
+    first: int  #: index of the first
+    n_lost: int  #: missing between the part before and this one
+    unsure: bool  #: whether `n_lost` does not rest on the counter alone
+
+
+def parts(numbered: Numbered, status: NDArray[np.integer], *, expected: int, longest: int) -> list[Part]:
+    """Cut samples at gaps and where their status changes, so that no part is longer than `longest`.
+
+    Parameters
+    ----------
+    numbered
+        The samples.
+    status
+        Of each, shape (n,).
+    expected
+        Index of the sample that should have come first.
+    longest
+        Samples.
+    """
+    index = numbered.index
     breaks = np.flatnonzero((np.diff(index) != 1) | (np.diff(status.astype(np.int64)) != 0)) + 1
-    edges = [0, *breaks.tolist(), len(index)]
-    return [
-        slice(begin, min(begin + longest, end))
-        for start, end in pairwise(edges)
-        for begin in range(start, end, longest)
-    ]
+    found = []
+    for start, stop in pairwise([0, *breaks.tolist(), len(index)]):
+        for begin in range(start, stop, longest):
+            first = int(index[begin])
+            found.append(
+                Part(slice(begin, min(begin + longest, stop)), first, first - expected, begin == numbered.unsure)
+            )
+            expected = int(index[found[-1].where.stop - 1]) + 1
+    return found

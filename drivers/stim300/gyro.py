@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
-from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
-from drivers.frame_stream import BATCH_TIME, FrameStream
+from drivers.errors import DeviceError, DeviceFaultError, ProtocolError
+from drivers.frame_stream import BATCH_TIME, LONGEST_BLOCK, FrameStream, SampleReader
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
-from drivers.protocol.sample_index import CounterError, SampleIndex, cut
+from drivers.protocol.sample_index import CounterError, Part, SampleIndex, parts
 from drivers.protocol.stim300 import (
     CONFIGURATION,
     COUNTER_RATE,
@@ -34,8 +34,6 @@ from drivers.protocol.stim300 import (
 )
 from drivers.stim300.settings import Settings, apply
 
-MAX_SILENCE = 1.0  # s
-LONGEST_BLOCK = 0.25  # s
 START_UP_TIME = 3.0  # s, in which the self-test waits for the end of the start-up
 _TURN = 2**24  # counts after which an integrated angle begins again
 
@@ -74,14 +72,10 @@ class Stim300Gyro:
         self._clock = clock
         self._settings = settings or Settings()
         self._stream = FrameStream(link, clock, decoder(), what="STIM300")
+        self._reader = SampleReader(self._stream, clock)
         self._configuration: Configuration | None = None
-        self._index: SampleIndex | None = None
-        self._waiting: list[Frames] = []
-        self._batch = 0
+        self._index = SampleIndex(span=COUNTER_SPAN, step=1, sample_rate=COUNTER_RATE)
         self._integral: NDArray[np.int32] | None = None
-        self._heard_at = 0.0
-        self._streaming = False
-        self._failure: DeviceError | None = None
 
     @property
     def sample_rate(self) -> float:
@@ -117,14 +111,13 @@ class Stim300Gyro:
         DeviceFaultError
             If it is not set to what is asked for, or cannot be used as it is set.
         """
-        self._streaming = False
-        self._failure = None
-        part = parse_part_number(self._ask(b"N\r", PART_NUMBER))
-        serial = parse_serial_number(self._ask(b"I\r", SERIAL_NUMBER))
-        self._configuration = parse_configuration(self._ask(b"C\r", CONFIGURATION))
+        self._reader.reset()
+        part = parse_part_number(self._ask(b"N\r", PART_NUMBER)[0])
+        serial = parse_serial_number(self._ask(b"I\r", SERIAL_NUMBER)[0])
+        self._configuration = parse_configuration(self._ask(b"C\r", CONFIGURATION)[0])
         if self._settings.differs_from(self._configuration):
             apply(self._settings, self._stream, self._clock)
-            self._configuration = parse_configuration(self._ask(b"C\r", CONFIGURATION))
+            self._configuration = parse_configuration(self._ask(b"C\r", CONFIGURATION)[0])
             self._settings.check(self._configuration)
         self._check(self._configuration)
         return DeviceIdentity(
@@ -139,7 +132,7 @@ class Stim300Gyro:
         """Ask for the extended error information; blocks up to 3 s while the unit starts up."""
         deadline = self._clock.now() + START_UP_TIME
         while True:
-            failures = parse_extended_error(self._ask(b"E\r", EXTENDED_ERROR))
+            failures = parse_extended_error(self._ask(b"E\r", EXTENDED_ERROR)[0])
             if START_UP_ERROR not in failures or self._clock.now() >= deadline:
                 return SelfTest(failures)
             self._clock.sleep_until(min(deadline, self._clock.now() + BATCH_TIME))
@@ -154,17 +147,16 @@ class Stim300Gyro:
         DeviceFaultError
             If its configuration has changed.
         """
-        if self._streaming:
+        if self._reader.under_way:
             return
-        before = self.configuration
-        if parse_configuration(self._ask(b"C\r", CONFIGURATION)) != before:
+        before, rate = self.configuration, round(self.sample_rate)
+        answer, waiting = self._ask(b"C\r", CONFIGURATION)
+        if parse_configuration(answer) != before:
             raise DeviceFaultError(f"{self._stream.link.name} has another configuration than when it was connected")
-        step = COUNTER_RATE // (before.sample_rate or COUNTER_RATE)
-        self._index = SampleIndex(span=COUNTER_SPAN, step=step, sample_rate=self.sample_rate)
-        self._stream.damaged()
+        self._index = SampleIndex(span=COUNTER_SPAN, step=COUNTER_RATE // rate, sample_rate=rate)
         self._integral = None
-        self._heard_at = self._clock.now()
-        self._streaming = True
+        batch = max(1, round(BATCH_TIME * rate)) * _datagram_size(before)
+        self._reader.begin(self._blocks, batch=batch, waiting=waiting)
 
     def read(self) -> list[RateBlock]:
         """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.
@@ -180,39 +172,21 @@ class Stim300Gyro:
         ProtocolError
             If it sends other datagrams than it was set to.
         """
-        if self._failure is not None:
-            raise self._failure
-        if self._index is None:
-            self._stream.take_raw()
-            return []
-        frames, self._waiting = self._waiting, []
-        frames += self._stream.take(self._batch if self._streaming else 0)
-        blocks = self._blocks(frames, self._index)
-        if self._failure is not None and not blocks:
-            raise self._failure
-        silence = self._clock.now() - self._heard_at
-        if self._streaming and silence > MAX_SILENCE and not self._stream.holds:
-            raise DeviceTimeoutError(
-                f"{self._stream.link.name} has sent no samples for {silence:.1f} s: was it switched off or unplugged?"
-            )
-        if not self._streaming:
-            self._index = None  # what was sent before the stop has been read
-        return blocks
+        return self._reader.read()
 
     def stop(self) -> None:
         """Take no more samples; the unit goes on sending. What was sent before can still be read."""
-        self._streaming = False
+        self._reader.end()
 
     def close(self) -> None:
         """Release the link; the unit goes on sending."""
-        self._streaming = False
+        self._reader.reset()
         self._stream.link.close()
 
-    def _ask(self, question: bytes, identifiers: tuple[int, int]) -> bytes:
-        """Return the body of the answer, and keep what came after it."""
-        answer, *self._waiting = self._stream.ask(question, tuple(bytes([code]) for code in identifiers))
-        body: bytes = answer.bodies[-1].tobytes()
-        return body
+    def _ask(self, question: bytes, identifiers: tuple[int, int]) -> tuple[bytes, list[Frames]]:
+        """Return the body of the answer, and what came after it."""
+        answer, *after = self._stream.ask(question, tuple(bytes([code]) for code in identifiers))
+        return answer.bodies[-1].tobytes(), after
 
     def _check(self, found: Configuration) -> None:
         """Raise DeviceFaultError if the unit cannot be used as it is set."""
@@ -224,95 +198,86 @@ class Stim300Gyro:
         if not all(found.axes):
             axes = ", ".join(axis for axis, active in zip("xyz", found.axes, strict=True) if not active)
             raise DeviceFaultError(f"{name} has its gyro {axes} switched off: all three are needed")
-        identifier = next(code for code, clusters in SAMPLE_IDS.items() if clusters == found.clusters)
-        size = wire_size(identifier, terminated=found.terminated)
+        size = _datagram_size(found)
         if found.bit_rate and size * 10 * found.sample_rate > found.bit_rate:
             raise DeviceFaultError(
                 f"{name} sends {size} bytes {found.sample_rate} times a second, too many for {found.bit_rate} bit/s: "
                 "samples would be lost"
             )
-        self._batch = max(1, round(BATCH_TIME * found.sample_rate)) * size
 
-    def _blocks(self, frames: list[Frames], index: SampleIndex) -> list[RateBlock]:
-        """Return the samples among the frames as blocks; note what is wrong in `_failure`."""
-        runs = [decode_samples(run) for run in frames if self._is_sample(run)]
+    def _blocks(self, frames: list[Frames], now: float) -> tuple[list[RateBlock], DeviceError | None]:
+        """Return the samples among the frames as blocks, up to what is wrong."""
+        runs, failure = [], None
+        for run in frames:
+            failure = self._wrong(run.header[0])
+            if failure is not None:
+                break
+            if run.header[0] in SAMPLE_IDS:
+                runs.append(decode_samples(run))
         if not runs:
-            return []
-        samples = np.concatenate(runs) if len(runs) > 1 else runs[0]
-        now = self._heard_at = self._clock.now()
+            return [], failure
         try:
-            return self._numbered(samples, index, now)
+            return self._number(np.concatenate(runs) if len(runs) > 1 else runs[0], now), failure
         except CounterError as error:
-            self._failure = DeviceFaultError(
-                f"{self._stream.link.name} has a sample counter that {error}: was it reset?"
-            )
-            return []
+            name = self._stream.link.name
+            return [], DeviceFaultError(f"{name} has a sample counter that {error}: was it reset?")
 
-    def _is_sample(self, run: Frames) -> bool:
-        identifier = run.header[0]
-        if self._failure is not None:
-            return False
-        if identifier in (*PART_NUMBER, *SERIAL_NUMBER):
-            self._failure = DeviceFaultError(f"{self._stream.link.name} was reset: it says again who it is")
-        clusters = SAMPLE_IDS.get(identifier)
-        if clusters is not None and clusters != self.configuration.clusters:
-            self._failure = ProtocolError(
-                f"{self._stream.link.name} sends datagrams {identifier:02X}, which are not those it is set to"
-            )
-        return clusters is not None and self._failure is None
+    def _wrong(self, identifier: int) -> DeviceError | None:
+        """Return what is wrong with a datagram in the stream."""
+        name = self._stream.link.name
+        if identifier in {*PART_NUMBER, *SERIAL_NUMBER}:
+            return DeviceFaultError(f"{name} was reset: it says again who it is")
+        if SAMPLE_IDS.get(identifier, self.configuration.clusters) != self.configuration.clusters:
+            return ProtocolError(f"{name} sends datagrams {identifier:02X}, which are not those it is set to")
+        return None
 
-    def _numbered(self, samples: NDArray[np.void], index: SampleIndex, now: float) -> list[RateBlock]:
+    def _number(self, samples: NDArray[np.void], now: float) -> list[RateBlock]:
+        """Return datagrams of samples as blocks."""
         counts = triple(samples, "rate")
         integrates = self.configuration.gyro is Output.INTEGRAL
         if integrates:
-            before = counts[:1] if self._integral is None else self._integral
-            differences = counts - np.concatenate((before, counts[:-1]))
-            if self._integral is None:  # the first one only says where the integral stands
-                samples, differences = samples[1:], differences[1:]
-            self._integral = counts[-1:]
-            counts = (differences + _TURN // 2) % _TURN - _TURN // 2
+            samples, counts = self._differences(samples, counts)
             if not len(samples):
                 return []
-        expected = index.next_index
-        numbered = index.number(samples["counter"], now, damaged=self._stream.damaged())
-        where, status = numbered.index, GYRO_STATUS[samples["rate_status"]]
-        unsure = None if numbered.unsure is None else int(where[numbered.unsure])
+        expected = self._index.next_index
+        numbered = self._index.number(samples["counter"], now, damaged=self._stream.damaged())
         if integrates:  # a difference over a gap is no sample
-            whole = np.diff(where, prepend=expected - 1) == 1
-            samples, counts, where, status = samples[whole], counts[whole], where[whole], status[whole]
-        blocks = []
-        for part in cut(where, status, longest=round(LONGEST_BLOCK * self.sample_rate)):
-            first = int(where[part.start])
-            flags = GyroStatus(int(status[part.start]))
-            if unsure is not None and expected <= unsure <= first:
-                flags |= GyroStatus.OVERRUN
-            blocks.append(self._block(samples[part], counts[part], first, flags, first - expected, now))
-            expected = int(where[part.stop - 1]) + 1
-        return blocks
+            whole = np.diff(numbered.index, prepend=expected - 1) == 1
+            samples, counts, numbered = samples[whole], counts[whole], numbered.only(whole)
+        status = GYRO_STATUS[samples["rate_status"]]
+        longest = round(LONGEST_BLOCK * self.sample_rate)
+        return [
+            self._block(samples[part.where], counts[part.where], part, status=int(status[part.where.start]), now=now)
+            for part in parts(numbered, status, expected=expected, longest=longest)
+        ]
+
+    def _differences(
+        self, samples: NDArray[np.void], counts: NDArray[np.int32]
+    ) -> tuple[NDArray[np.void], NDArray[np.int32]]:
+        """Return how far the integrated angles have gone; the very first only says where they stand."""
+        before, self._integral = self._integral, counts[-1:]
+        if before is None:
+            before, samples, counts = counts[:1], samples[1:], counts[1:]
+        gone = counts - np.concatenate((before, counts[:-1]))
+        return samples, (gone + _TURN // 2) % _TURN - _TURN // 2
 
     def _block(
-        self,
-        samples: NDArray[np.void],
-        counts: NDArray[np.int32],
-        first: int,
-        status: GyroStatus,
-        n_lost: int,
-        now: float,
+        self, samples: NDArray[np.void], counts: NDArray[np.int32], part: Part, *, status: int, now: float
     ) -> RateBlock:
         found = self.configuration
         temperature = None
         if Cluster.TEMPERATURE in found.clusters:
             temperature = float(samples["rate_temperature"].mean()) / 256
         return RateBlock(
-            first_index=first,
-            device_time=first / self.sample_rate,
+            first_index=part.first,
+            device_time=part.first / self.sample_rate,
             arrival_time=now,
             counts=counts,
             rate_lsb=found.rate_lsb,
             temperature=temperature,
             specific_force=self._specific_force(samples),
-            status=status,
-            n_lost=n_lost,
+            status=GyroStatus(status) | (GyroStatus.OVERRUN if part.unsure else GyroStatus.OK),
+            n_lost=part.n_lost,
         )
 
     def _specific_force(self, samples: NDArray[np.void]) -> tuple[float, float, float] | None:
@@ -326,3 +291,8 @@ class Stim300Gyro:
                 x, y, z = (triple(samples, name).mean(axis=0) * lsb).tolist()
                 return x, y, z
         return None
+
+
+def _datagram_size(found: Configuration) -> int:
+    identifier = next(code for code, clusters in SAMPLE_IDS.items() if clusters == found.clusters)
+    return wire_size(identifier, terminated=found.terminated)
