@@ -108,6 +108,8 @@ class MeasurementTable(msgspec.Struct, forbid_unknown_fields=True, frozen=True, 
     azimuth_deg: float | None = None
     settle_s: float = 0.5
     latitude_deg: float | None = None
+    position: str | None = None  #: LAT,LON[,HEIGHT] in deg and m
+    epsg: int | None = None  #: of the grid; None for the UTM zone
 
 
 class Config(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):

@@ -9,7 +9,8 @@ from typing import Any
 
 import msgspec
 
-from northfinder.errors import RecordError
+from northfinder.errors import ConfigError, RecordError
+from northfinder.geodesy import Place, bearings_json
 from northfinder.record import Record
 from northfinder.record_facts import completeness, gyro_identity, record_date
 from northfinder.reduction import reduce_record
@@ -25,6 +26,7 @@ def solve_file(
     *,
     revise: Callable[[Assumptions], Assumptions] = lambda kept: kept,
     input_axis_offset: float | None = None,
+    place: Place | None = None,
 ) -> dict[str, Any]:
     """Return the fix from a file of any kind.
 
@@ -39,9 +41,13 @@ def solve_file(
     input_axis_offset : float, optional
         For a table of dwells: where the input axis points at stage azimuth zero, rad. If not given, what the file
         states, or zero.
+    place : Place, optional
+        In place of the one kept in a record; for grid azimuth and magnetic bearing.
 
     Raises
     ------
+    ConfigError
+        A place is given with a table, which has no date.
     RecordError
         The file is of no kind known, or damaged.
     EstimateError
@@ -53,7 +59,9 @@ def solve_file(
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
     if is_record:
-        return solve_record(path, assumptions, revise=revise)
+        return solve_record(path, assumptions, revise=revise, place=place)
+    if place is not None:
+        raise ConfigError(f"{path} is a table without a date: a position is for a record")
     latitude_deg = revise(assumptions or Assumptions()).latitude_deg
     latitude = None if latitude_deg is None else math.radians(latitude_deg)
     return _solve_table(read_table(path), latitude, input_axis_offset)
@@ -64,6 +72,7 @@ def solve_record(
     assumptions: Assumptions | None = None,
     *,
     revise: Callable[[Assumptions], Assumptions] = lambda kept: kept,
+    place: Place | None = None,
 ) -> dict[str, Any]:
     """Return the fix from a record, under its own assumptions unless others are given.
 
@@ -77,7 +86,14 @@ def solve_record(
         fix = solve(means, assumptions)
         plan = record.meta("plan") or {}
         about = {"plan": plan.get("name"), "record": str(path)} | completeness(record)
-    return fix_to_json(fix) | supplement(means, assumptions, fix) | about
+        result = fix_to_json(fix) | supplement(means, assumptions, fix) | about
+        return result | kept_bearings(record, result, place)
+
+
+def kept_bearings(record: Record, result: dict[str, Any], place: Place | None = None) -> dict[str, Any]:
+    """Return grid azimuth and magnetic bearing of the result of a record, nothing if no place is given or kept."""
+    place = place or Place.from_json(record.meta("place"))
+    return {} if place is None else bearings_json(place, result, record_date(record))
 
 
 def kept_assumptions(record: Record) -> Assumptions:

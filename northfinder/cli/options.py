@@ -14,6 +14,26 @@ Command = Callable[..., Any]
 METHODS = ("generalised", "ordinary")
 
 
+def position_options(command: Command) -> Command:
+    """Add the options that say where the instrument stands, for grid azimuth and magnetic bearing."""
+    options = [
+        click.option(
+            "--position",
+            metavar="LAT,LON[,HEIGHT]",
+            help="Of the instrument, in deg and m: adds grid azimuth and magnetic bearing.",
+        ),
+        click.option(
+            "--epsg",
+            type=click.IntRange(min=1),
+            metavar="CODE",
+            help="The grid, a projected coordinate reference system; if not given, the UTM zone.",
+        ),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 def estimation_options(command: Command) -> Command:
     """Add the options that say how to estimate and what is known beforehand."""
     options = [

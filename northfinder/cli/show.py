@@ -26,12 +26,9 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
     """Print a fix as a panel; `truth` is the emulator's (azimuth, latitude) in deg."""
     table = Table.grid(padding=(0, 2))
     table.add_row("azimuth", f"[bold]{_with_sd(result['azimuth_deg'], result['azimuth_sd_deg'])}[/bold]")
-    if result["latitude_deg"] is None:
-        table.add_row("latitude", f"not measured: {result['latitude_reason']}")
-    elif result["latitude_sd_deg"] == 0:
-        table.add_row("latitude", f"{result['latitude_deg']:.3f} deg, as given")
-    else:
-        table.add_row("latitude", f"[bold]{_with_sd(result['latitude_deg'], result['latitude_sd_deg'])}[/bold]")
+    table.add_row("latitude", _latitude(result))
+    for row in _bearings(result):
+        table.add_row(*row)
     if truth is not None:
         table.add_row("truth", f"azimuth {truth[0]:g} deg, latitude {truth[1]:g} deg, in the emulator")
     biases = result["bias_dph"] if isinstance(result["bias_dph"], list) else [result["bias_dph"]]
@@ -50,6 +47,33 @@ def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None
             table.add_row("record", f"[red]ends before the measurement did, {result['steps']}[/red]")
         table.add_row("record", printable(result["record"]))
     Console().print(Panel(table, title="true north", expand=False))
+
+
+def _latitude(result: Mapping[str, Any]) -> str:
+    if result["latitude_deg"] is None:
+        return f"not measured: {result['latitude_reason']}"
+    if result["latitude_sd_deg"] == 0:
+        return f"{result['latitude_deg']:.3f} deg, as given"
+    return f"[bold]{_with_sd(result['latitude_deg'], result['latitude_sd_deg'])}[/bold]"
+
+
+def _bearings(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield what the azimuth is on a map and by a compass, or why it is not known, where a position was given."""
+    if "position" not in result:
+        return
+    grid, magnetic = result["grid"], result["magnetic"]
+    if "reason" in grid:
+        yield "grid azimuth", f"none: {printable(grid['reason'])}"
+    else:
+        yield "grid azimuth", f"[bold]{_with_sd(grid['azimuth_deg'], grid['azimuth_sd_deg'])}[/bold]"
+        yield "", f"convergence {grid['convergence_deg']:.4f} deg, {printable(grid['name'])} (EPSG:{grid['epsg']})"
+    if "reason" in magnetic:
+        yield "magnetic", f"none: {printable(magnetic['reason'])}"
+        return
+    yield "magnetic", f"[bold]{_with_sd(magnetic['bearing_deg'], magnetic['bearing_sd_deg'])}[/bold]"
+    declination = _with_sd(magnetic["declination_deg"], magnetic["declination_sd_deg"])
+    yield "", f"declination {declination} on {magnetic['date']}"
+    yield "", f"by {magnetic['model']}, which holds from {magnetic['valid_from']} to {magnetic['valid_until']}"
 
 
 def _notes(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from northfinder.calibration import read_calibration
-from northfinder.cli.options import estimation_options
+from northfinder.cli.options import estimation_options, position_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
+from northfinder.geodesy import Place
 from northfinder.solution import Assumptions, Method
 from northfinder.solve_file import solve_file
 from northfinder.text import printable
@@ -33,6 +34,7 @@ _REVISED = {name: name for name in ("latitude_deg", "latitude_sd_deg", "profile"
     metavar="DEG",
     help="For a table of dwells: where the input axis points at stage azimuth zero, if not as the file says.",
 )
+@position_options
 @estimation_options
 @click.pass_context
 def command(
@@ -40,6 +42,8 @@ def command(
     *,
     file: Path,
     offset_deg: float | None,
+    position: str | None,
+    epsg: int | None,
     latitude_deg: float | None,
     latitude_sd_deg: float,
     calibration_file: Path | None,
@@ -72,7 +76,13 @@ def command(
         if source is not click.core.ParameterSource.DEFAULT
     }
     offset = None if offset_deg is None else math.radians(offset_deg)
-    result = solve_file(file, None, revise=lambda kept: replace(kept, **changes), input_axis_offset=offset)
+    result = solve_file(
+        file,
+        None,
+        revise=lambda kept: replace(kept, **changes),
+        input_axis_offset=offset,
+        place=Place.of(position, epsg),
+    )
     if as_json:
         print_json(result)
     elif "checks" in result:
