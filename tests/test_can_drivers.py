@@ -330,11 +330,17 @@ homing_method = 33
 home_speed_deg_s = {}
 """
     bench.write_text(text.format("cia402-stage:virtual:b/32,33", 9))
-    options = read_config(bench).stage.driver_options()["drive"]
+
+    def drive_options() -> object:
+        stage = read_config(bench).stage
+        assert stage is not None
+        return stage.driver_options()["drive"]
+
+    options = drive_options()
     assert options == DriveOptions(units_per_turn=(-3600.0, None), homing_method=33, home_speed=radians(9))
     bench.write_text(text.format("native:/dev/ttyUSB0", 9))
     with pytest.raises(ConfigError, match="is for a cia402-stage, not for native:/dev/ttyUSB0"):
-        read_config(bench).stage.driver_options()
+        drive_options()
     bench.write_text(text.format("cia402-stage:virtual:b/32,33", -1))
     with pytest.raises(ConfigError, match="home_speed must be positive"):
-        read_config(bench).stage.driver_options()
+        drive_options()

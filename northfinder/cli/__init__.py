@@ -16,6 +16,7 @@ EXIT_USAGE = 2
 EXIT_DEVICE = 3
 EXIT_ESTIMATE = 4
 EXIT_RECORD = 5
+EXIT_FINDING = 6
 EXIT_INTERRUPTED = 130
 
 _COMMANDS = {
@@ -28,6 +29,7 @@ _COMMANDS = {
     "allan": "Identify a gyro's noise from a recording at rest.",
     "emulate": "Serve an emulated gyro and stage.",
     "devices": "List the ports and identify what answers.",
+    "doctor": "Check a bench and say in words what is wrong.",
 }
 
 
@@ -56,7 +58,7 @@ class _LazyGroup(click.Group):
     cls=_LazyGroup,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog="Exit codes: 0 done, 2 usage or configuration, 3 device or link, 4 no trustworthy estimate, "
-    "5 record or file, 130 interrupted.",
+    "5 record or file, 6 a check of doctor has failed, 130 interrupted.",
 )
 @click.version_option(package_name="northfinder")
 def cli() -> None:

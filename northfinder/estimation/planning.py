@@ -49,7 +49,9 @@ class Prediction:
     latitude_sd: float | None  #: None where the dwells do not measure the latitude
 
 
-def planned_means(dwells: Sequence[PlannedDwell], truth: Truth, *, known: Known, interval: float = 1.0) -> RateMeans:
+def planned_means(
+    dwells: Sequence[PlannedDwell], truth: Truth, *, known: Known, interval: float = 1.0, n_axes: int = 1
+) -> RateMeans:
     """Return noise-free means over `interval` s, the last one of a dwell shorter, as measured ones would be cut."""
     counts = [max(1, math.ceil(dwell.duration / interval - 1e-6)) for dwell in dwells]
     order = np.repeat(np.arange(len(dwells)), counts)
@@ -59,7 +61,7 @@ def planned_means(dwells: Sequence[PlannedDwell], truth: Truth, *, known: Known,
         for name in ("start", "duration", "azimuth", "elevation")
     )
     duration = np.minimum(interval, length - offset)
-    h = sensitivity(azimuth, elevation, np.zeros((order.size, 2)))[:, 0]
+    h = sensitivity(azimuth, elevation, np.zeros((order.size, 2)), n_axes=n_axes)
     nev = rates(truth.azimuth, truth.latitude, known.scale_factor or 1.0)
     nev[2] += known.acceleration_sensitive_drift_rate
     return RateMeans(
@@ -74,7 +76,13 @@ def planned_means(dwells: Sequence[PlannedDwell], truth: Truth, *, known: Known,
 
 
 def predict(
-    dwells: Sequence[PlannedDwell], noise: NoiseModel, known: Known, truth: Truth, *, interval: float = 1.0
+    dwells: Sequence[PlannedDwell],
+    noise: NoiseModel,
+    known: Known,
+    truth: Truth,
+    *,
+    interval: float = 1.0,
+    n_axes: int = 1,
 ) -> Prediction:
     """Return the standard deviations that generalised least squares will state after these dwells.
 
@@ -88,6 +96,8 @@ def predict(
         At which the covariance is taken.
     interval : float
         Length of the means, s.
+    n_axes : int
+        Of the gyro, 1 or 3.
 
     Raises
     ------
@@ -96,6 +106,6 @@ def predict(
     """
     if not dwells:
         raise EstimateError("a plan without a dwell determines nothing")
-    means = planned_means(dwells, truth, known=known, interval=interval)
+    means = planned_means(dwells, truth, known=known, interval=interval, n_axes=n_axes)
     fix = estimate(means, noise=noise, known=known, weights="generalised")
     return Prediction(azimuth_sd=fix.azimuth_sd, latitude_sd=None if known.latitude is not None else fix.latitude_sd)
