@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +186,15 @@ def test_the_drivers_on_the_bus_of_a_program() -> None:
             lockstep.close()
 
 
+@contextmanager
+def ending(child: subprocess.Popen[bytes]) -> Iterator[None]:
+    """End a program, whatever has happened."""
+    try:
+        yield
+    finally:
+        child.terminate()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
 def test_canlog_names_what_passes(tmp_path: Path) -> None:
     """The log of a bus reads in names, and reads the same from its recording; a stranger's frames stay numbers."""
@@ -197,17 +205,15 @@ def test_canlog_names_what_passes(tmp_path: Path) -> None:
     with emulator("--bus", "socketcand", "--speed", "5") as addresses, shown.open("w") as out:
         where = addresses["gyro"].removeprefix("canopen-gyro:").rpartition("/")[0]
         command = [sys.executable, "-u", str(tool), where, "--out", str(recording)]
-        with subprocess.Popen(command, stdout=out) as log:
+        with subprocess.Popen(command, stdout=out) as log, ending(log):
             while not shown.stat().st_size and clock.now() < deadline:
                 clock.wait(clock.now() + 0.05)
-            gyro = open_gyro(addresses["gyro"], clock)
-            gyro.connect()
-            gyro.start()
-            while not all(part in shown.read_text() for part in LOGGED) and clock.now() < deadline:
-                gyro.read()
-                clock.wait(clock.now() + 0.05)
-            gyro.close()
-            log.send_signal(signal.SIGINT)
+            with closing(open_gyro(addresses["gyro"], clock)) as gyro:
+                gyro.connect()
+                gyro.start()
+                while not all(part in shown.read_text() for part in LOGGED) and clock.now() < deadline:
+                    gyro.read()
+                    clock.wait(clock.now() + 0.05)
         assert log.returncode == 0
     text = shown.read_text()
     for part in LOGGED:
