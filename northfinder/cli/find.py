@@ -4,39 +4,35 @@ from __future__ import annotations
 
 import math
 import secrets
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from types import FrameType
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 import msgspec
 
 from drivers.api import Clock, Gyro, Stage
-from drivers.discovery import open_gyro, open_stage
 from drivers.fixed_mount import FixedMount
 from drivers.transport.clock import SystemClock
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.calibration import Calibration, checked, read_calibration
+from northfinder.cli.bench import gyro_of, named_bench, stage_of, stop_on_signal
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.operator import TerminalOperator
 from northfinder.cli.options import estimation_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
-from northfinder.config import Config, GyroTable, MeasurementTable, StageTable, read_config
+from northfinder.config import Config, GyroTable, MeasurementTable, StageTable
 from northfinder.errors import ConfigError
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
 from northfinder.triad_plans import TRIAD_PLANS, fit_for
-
-Device = TypeVar("Device", Gyro, Stage)
 
 #: When the command was given, as near as can be told.
 STARTED = time.monotonic()
@@ -105,7 +101,7 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
     with ExitStack() as stack:
         if truth is not None:
             config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
-        stop_requested = stack.enter_context(_stop_on_signal(clock))
+        stop_requested = stack.enter_context(stop_on_signal(clock))
         display = stack.enter_context(DisplayContext(clock, quiet=options.quiet))
         results: list[dict[str, Any]] = []
         for _ in range(options.repeat):
@@ -163,16 +159,7 @@ class Options:
         named = self.config_file or self.gyro_address or self.stage_address
         if named and (self.seed is not None or self.bus is not None):
             raise ConfigError("--seed and --bus are of the emulated bench: leave them out where devices are named")
-        if self.config_file is not None:
-            if self.gyro_address or self.stage_address:
-                raise ConfigError("--config names the devices: leave --gyro and --stage out")
-            return read_config(self.config_file)
-        if self.gyro_address is None and self.stage_address is None:
-            return None
-        if self.gyro_address is None:
-            raise ConfigError("--stage goes with --gyro, and that is missing")
-        stage = None if self.stage_address is None else StageTable(address=self.stage_address)
-        return Config(gyro=GyroTable(address=self.gyro_address), stage=stage)
+        return named_bench(self.gyro_address, self.stage_address, self.config_file)
 
     def emulated_bench(self) -> Config:
         """Return the bench to emulate, without addresses yet; at rest there is no stage on it."""
@@ -283,28 +270,19 @@ def _check_stage(config: Config, plan: str) -> None:
 
 def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None, plan: str) -> Gyro:
     """Open the gyro; connecting it checks that it has the axes for the plan, and that the calibration is its own."""
-    gyro: Gyro = _opened(open_gyro, table.address, clock, **table.driver_options())
-    return fit_for(checked(gyro, calibration, _today()), plan)
+    return fit_for(checked(gyro_of(table, clock), calibration, _today()), plan)
 
 
 def _stage_opener(table: StageTable | None, clock: Clock, plan: str, say: Callable[[str], None]) -> Callable[[], Stage]:
     """Return what opens the stage, or what stands for it; raises ConfigError if that takes a terminal."""
     if table is not None:
-        return partial(_opened, open_stage, table.address, clock, limits=table.limits(), **table.driver_options())
+        return partial(stage_of, table, clock)
     operator = TerminalOperator(clock, say) if plan == "two-position" else None
     return lambda: FixedMount(clock, operator)
 
 
 def _today() -> date:
     return datetime.now(UTC).date()
-
-
-def _opened(opener: Callable[..., Device], address: str, clock: Clock, **options: object) -> Device:
-    """Open a device by its address; an address that names none is the operator's mistake."""
-    try:
-        return opener(address, clock, **options)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
 
 
 def _emulated(config: Config, emulator: EmulatorProcess) -> Config:
@@ -320,22 +298,3 @@ def _emulated(config: Config, emulator: EmulatorProcess) -> Config:
 def _record_path(folder: Path) -> Path:
     """Return a new name in `folder`, by date and time."""
     return folder / f"north-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}Z.sqlite"
-
-
-@contextmanager
-def _stop_on_signal(clock: SystemClock) -> Iterator[Callable[[], bool]]:
-    """Let the first Ctrl-C, termination or hang-up ask for a stop; yield the question whether one was asked for."""
-    requested = False
-
-    def request(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  # the signal module's signature
-        nonlocal requested
-        requested = True
-        clock.notify()
-
-    signals = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.signal(number, request) for number in signals}
-    try:
-        yield lambda: requested
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
