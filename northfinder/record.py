@@ -158,6 +158,12 @@ class Record:
             found = self._db.execute(f"SELECT max(id) FROM {table}").fetchone()[0]  # noqa: S608  # names of ours
         return found if isinstance(found, int) else 0
 
+    def totals(self) -> tuple[int, int]:
+        """Return how many samples the record holds, and how many are missing between its blocks, as it says itself."""
+        with one_line(self.path, "read"):
+            n_samples, n_lost = self._db.execute("SELECT sum(n_samples), sum(n_lost) FROM block").fetchone()
+        return n_samples or 0, n_lost or 0
+
     def _damaged(self, what: str) -> RecordError:
         return RecordError(f"the record {self.path} is damaged: {what}; northfinder recover saves the rest")
 

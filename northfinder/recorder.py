@@ -55,6 +55,7 @@ class Recorder:
         self._next_row = dict.fromkeys(TABLES, 1)
         if resume:
             with Record(path) as record:
+                self.n_samples, self.n_lost = record.totals()
                 self._next_row = {table: record.count(table) + 1 for table in TABLES}
                 self.stream = max((info.stream for info in record.streams()), default=-1) + 1
         opened = record_writer.reopen(path) if resume else record_writer.create(path)

@@ -6,7 +6,10 @@ A command's module is imported only when that command runs, so that ``northfinde
 from __future__ import annotations
 
 import importlib
+import os
 import sys
+import threading
+from contextlib import suppress
 from typing import NoReturn
 
 import click
@@ -21,9 +24,17 @@ EXIT_INTERRUPTED = 130
 
 _COMMANDS = {
     "find": "Measure the true azimuth and the latitude.",
+    "resume": "Go on with a measurement that was interrupted.",
     "plan": "Predict what each plan gives in a given time.",
     "budget": "Predict what a fix will owe its uncertainty to.",
     "solve": "Estimate again from a record, or from a table of measurements.",
+    "records": "List the records in a folder.",
+    "show": "Show what a record holds.",
+    "note": "Add an operator's note to a record.",
+    "check": "Check that a record is sound.",
+    "recover": "Save what is left of a damaged record.",
+    "export": "Write a record's samples as CSV, Parquet, NPZ or MAT.",
+    "report": "Write a record, or a campaign, as a page, a picture or data.",
     "stats": "Show what a campaign of measurements says of the instrument.",
     "calibrate": "Find an instrument's constants where the truth is known.",
     "allan": "Identify a gyro's noise from a recording at rest.",
@@ -31,6 +42,12 @@ _COMMANDS = {
     "devices": "List the ports and identify what answers.",
     "doctor": "Check a bench and say in words what is wrong.",
 }
+
+
+#: Name of the thread that shows how a measurement goes on.
+DISPLAY_THREAD = "display"
+#: Commands whose module is not named as they are.
+_MODULES = {"show": "show_record"}
 
 
 class _LazyGroup(click.Group):
@@ -44,7 +61,7 @@ class _LazyGroup(click.Group):
         """Import the command."""
         if cmd_name not in _COMMANDS:
             return None
-        module = importlib.import_module(f"northfinder.cli.{cmd_name}")
+        module = importlib.import_module(f"northfinder.cli.{_MODULES.get(cmd_name, cmd_name)}")
         command: click.Command = module.command
         return command
 
@@ -84,13 +101,38 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         error.show()
         code = error.exit_code
     except (DeviceError, NorthFinderError) as error:
-        print(f"northfinder: {printable(str(error), max_length=1000)}", file=sys.stderr)  # noqa: T201  # the one line
+        _complain(f"northfinder: {printable(str(error), max_length=1000)}")
         code = exit_code(error)
     except BrokenPipeError:
         # Whoever read our output has gone; nothing is left to say to them.
         sys.stderr.close()
         code = 1
-    sys.exit(code if isinstance(code, int) else 0)
+    _leave(code if isinstance(code, int) else 0)
+
+
+def _display_is_stuck() -> bool:
+    """Return whether whoever should read what a measurement shows has stopped reading."""
+    return any(thread.name == DISPLAY_THREAD for thread in threading.enumerate())
+
+
+def _complain(line: str) -> None:
+    """Print the one line of a failure, if anybody is there to read it."""
+    if not _display_is_stuck():
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)  # noqa: T201  # the one line
+
+
+def _leave(code: int) -> NoReturn:
+    """Leave with `code`, whatever has become of the terminal."""
+    if _display_is_stuck():  # it holds the lock of a stream that Python would wait for
+        os._exit(code)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # nobody reads any more, and nothing is left to say
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    sys.exit(code)
 
 
 def exit_code(error: Exception) -> int:

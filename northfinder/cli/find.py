@@ -22,14 +22,16 @@ from drivers.fixed_mount import FixedMount
 from drivers.transport.clock import SystemClock
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.calibration import Calibration, checked, read_calibration
+from northfinder.cli.aside import Aside
 from northfinder.cli.bench import gyro_of, named_bench, stage_of, stop_on_signal
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.operator import TerminalOperator
-from northfinder.cli.options import estimation_options
+from northfinder.cli.options import estimation_options, position_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.config import Config, GyroTable, MeasurementTable, StageTable
 from northfinder.errors import ConfigError
+from northfinder.geodesy import Place, bearings_json
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
 from northfinder.triad_plans import TRIAD_PLANS, fit_for
@@ -77,6 +79,7 @@ STARTED = time.monotonic()
 @click.option("--seed", type=click.IntRange(min=0), help="Of the emulated noise; random if not given.")
 @click.option("--speed", default="1", show_default=True, metavar="X|max", help="Emulator's speed over real time.")
 @click.option("--bus", type=click.Choice(["socketcand", "slcan"]), help="Emulate a CAN bus instead of serial lines.")
+@position_options
 @estimation_options
 def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of Options
     """Measure the true azimuth of the input axis at stage azimuth zero, and the latitude.
@@ -94,6 +97,7 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
     truth = None if bench else options.truth()
     config = bench or options.emulated_bench()
     assumptions = options.assumptions(config)
+    place = options.place(config.measurement)
     wishes = options.wishes(config.measurement)
     plan = make_plan(wishes, assumptions, settle=config.measurement.settle_s)
     _check_stage(config, plan.name)
@@ -102,21 +106,29 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
         if truth is not None:
             config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
         stop_requested = stack.enter_context(stop_on_signal(clock))
-        display = stack.enter_context(DisplayContext(clock, quiet=options.quiet))
+        display = stack.enter_context(Aside(DisplayContext(clock, quiet=options.quiet)))
         results: list[dict[str, Any]] = []
         for _ in range(options.repeat):
             begun = time.monotonic() if results else STARTED
             measurement = Measurement(
-                open_gyro=partial(_open_gyro, config.gyro, clock, assumptions.calibration, plan.name),
-                open_stage=_stage_opener(config.stage, clock, plan.name, display.say),
+                open_gyro=partial(planned_gyro, config.gyro, clock, assumptions.calibration, plan.name),
+                open_stage=stage_opener(config.stage, clock, plan.name, display.say),
                 plan=plan,
                 settle=config.measurement.settle_s,
                 assumptions=assumptions,
                 record=_record_path(options.out),
-                meta={"northfinder": version("northfinder"), "config": config, "simulation": truth},
+                meta={
+                    "northfinder": version("northfinder"),
+                    "config": config,
+                    "simulation": truth,
+                    "wishes": wishes,
+                    "place": None if place is None else place.to_json(),
+                },
             )
             outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
-            results.append(outcome.to_json() | {"plan": plan.name, "wall_s": round(time.monotonic() - begun, 3)})
+            result = outcome.to_json() | {"plan": plan.name}
+            result |= {} if place is None else bearings_json(place, result, _today())
+            results.append(result | {"wall_s": round(time.monotonic() - begun, 3)})
     _show(results, None if truth is None else (truth.azimuth_deg, truth.latitude_deg), as_json=options.as_json)
     for result in results:
         require_trustworthy(result)
@@ -146,6 +158,8 @@ class Options:
     seed: int | None
     speed: str
     bus: str | None
+    position: str | None
+    epsg: int | None
     latitude_deg: float | None
     latitude_sd_deg: float
     calibration_file: Path | None
@@ -200,6 +214,10 @@ class Options:
             calibration=calibration,
             turn_sd_deg=self.turn_sd_deg if config.stage is None and self._plan(config) == "two-position" else 0.0,
         )
+
+    def place(self, table: MeasurementTable) -> Place | None:
+        """Return where the instrument stands, by the options or else by the configuration. Raises ConfigError."""
+        return Place.of(self.position or table.position, table.epsg if self.epsg is None else self.epsg)
 
     def _plan(self, config: Config) -> str | None:
         return self.plan or config.measurement.plan
@@ -268,12 +286,12 @@ def _check_stage(config: Config, plan: str) -> None:
         )
 
 
-def _open_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None, plan: str) -> Gyro:
+def planned_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None, plan: str) -> Gyro:
     """Open the gyro; connecting it checks that it has the axes for the plan, and that the calibration is its own."""
     return fit_for(checked(gyro_of(table, clock), calibration, _today()), plan)
 
 
-def _stage_opener(table: StageTable | None, clock: Clock, plan: str, say: Callable[[str], None]) -> Callable[[], Stage]:
+def stage_opener(table: StageTable | None, clock: Clock, plan: str, say: Callable[[str], None]) -> Callable[[], Stage]:
     """Return what opens the stage, or what stands for it; raises ConfigError if that takes a terminal."""
     if table is not None:
         return partial(stage_of, table, clock)

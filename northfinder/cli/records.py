@@ -9,7 +9,7 @@ from typing import Any
 import click
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from northfinder.cli.show import print_json
 from northfinder.record_summary import list_records
@@ -32,7 +32,7 @@ def command(*, folder: Path, as_json: bool) -> None:
     if as_json:
         print_json({"records": lines})
         return
-    table = Table("record", "begun, UTC", "state", "plan", "done", "azimuth, deg", "latitude, deg", "MB", box=SIMPLE)
+    table = Table(Column("record", no_wrap=True), "state", "plan", "steps", "azimuth, deg", "MB", box=SIMPLE)
     for line in lines:
         table.add_row(*_cells(line))
     Console().print(table if lines else f"no records in {printable(str(folder))}")
@@ -40,15 +40,12 @@ def command(*, folder: Path, as_json: bool) -> None:
 
 def _cells(line: dict[str, Any]) -> tuple[str, ...]:
     style = _STYLE[line["state"]]
-    started = line["started_utc_s"]
     return (
         printable(Path(line["record"]).name),
-        "" if started is None else utc_text(started),
         f"[{style}]{line['state']}[/{style}]",
         printable(str(line["plan"] or "")),
-        printable(str(line["steps"] or "")),
+        printable(str(line["steps"] or "").removesuffix(" steps").replace(" of the ", "/")),
         _with_sd(line["azimuth_deg"], line["azimuth_sd_deg"]),
-        _with_sd(line["latitude_deg"], line["latitude_sd_deg"]),
         f"{line['size_bytes'] / 1e6:.1f}",
     )
 
