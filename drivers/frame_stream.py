@@ -10,7 +10,10 @@ from drivers.protocol.crc_frames import CrcFrameCounts, CrcFrameDecoder, Frames
 
 BATCH_TIME = 0.2  # s of samples that are decoded together
 LONGEST_BLOCK = 0.25  # s
-MAX_SILENCE = 1.0  # s
+MAX_SILENCE = 1.0  # s, or three samples if that is longer
+_DRAIN_TIME = 0.06  # s, more than a reader of a port that was full takes to read on
+_DRAIN_SLACK = 256  # bytes
+_MAX_DRAINS = 20
 _LONGEST_HOLD = 0.25  # s for which bytes wait for more of them
 
 
@@ -81,6 +84,15 @@ class FrameStream:
         self._pending.clear()
         self._n_pending = 0
         return data
+
+    def drain(self, *, bytes_per_second: float) -> None:
+        """Throw away what has come, until no more comes than is being sent: what waited in buffers is gone then."""
+        for _ in range(_MAX_DRAINS):
+            self.take_raw()
+            before = self._clock.now()
+            self._clock.sleep_until(before + _DRAIN_TIME)
+            if len(self.take_raw()) <= 2 * bytes_per_second * (self._clock.now() - before) + _DRAIN_SLACK:
+                return
 
     def ask(
         self, question: bytes, headers: tuple[bytes, ...], *, attempts: int = 3, patience: float = 0.5
@@ -169,6 +181,7 @@ class SampleReader:
         self._clock = clock
         self._assemble: Assemble | None = None
         self._batch = 0
+        self._max_silence = MAX_SILENCE
         self._waiting: list[Frames] = []
         self._ended = False
         self._heard_at = 0.0
@@ -179,9 +192,11 @@ class SampleReader:
         """Whether samples are read."""
         return self._assemble is not None and not self._ended
 
-    def begin(self, assemble: Assemble, *, batch: int, waiting: list[Frames]) -> None:
-        """Read samples from now on, `batch` bytes at a time; `waiting` have come already."""
-        self._assemble, self._batch, self._waiting = assemble, batch, waiting
+    def begin(self, assemble: Assemble, *, sample_rate: float, frame_size: int, waiting: list[Frames]) -> None:
+        """Read samples from now on; `waiting` have come already."""
+        self._assemble, self._waiting = assemble, waiting
+        self._batch = max(1, round(BATCH_TIME * sample_rate)) * frame_size
+        self._max_silence = max(MAX_SILENCE, 3 / sample_rate)
         self._ended, self._failure = False, None
         self._heard_at = self._clock.now()
         self._stream.damaged()
@@ -211,7 +226,7 @@ class SampleReader:
             self._heard_at = now
         elif self._failure is not None:
             raise self._failure
-        elif not self._ended and now - self._heard_at > MAX_SILENCE and not self._stream.holds:
+        elif not self._ended and now - self._heard_at > self._max_silence and not self._stream.holds:
             raise DeviceTimeoutError(
                 f"{self._stream.link.name} has sent no samples for {now - self._heard_at:.1f} s: "
                 "was it switched off or unplugged?"

@@ -155,8 +155,7 @@ class Stim300Gyro:
             raise DeviceFaultError(f"{self._stream.link.name} has another configuration than when it was connected")
         self._index = SampleIndex(span=COUNTER_SPAN, step=COUNTER_RATE // rate, sample_rate=rate)
         self._integral = None
-        batch = max(1, round(BATCH_TIME * rate)) * _datagram_size(before)
-        self._reader.begin(self._blocks, batch=batch, waiting=waiting)
+        self._reader.begin(self._blocks, sample_rate=rate, frame_size=_datagram_size(before), waiting=waiting)
 
     def read(self) -> list[RateBlock]:
         """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.

@@ -1,0 +1,230 @@
+"""A KVH gyro of one or three axes: it streams by itself, and is asked what its numbers mean before they are used."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
+from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
+from drivers.frame_stream import LONGEST_BLOCK, FrameStream, SampleReader
+from drivers.kvh.settings import Found, configure
+from drivers.protocol.crc_frames import CrcFrameCounts, Frames
+from drivers.protocol.kvh import (
+    ACCELEROMETERS_VALID,
+    FORMATS,
+    GYROS_VALID,
+    SEQUENCE_SPAN,
+    decode_messages,
+    decoder,
+    find_test,
+    wire_size,
+)
+from drivers.protocol.sample_index import Part, SampleIndex, parts
+
+STANDARD_GRAVITY = 9.80665  # m/s^2
+_LOOK_TIME = 3.0  # s in which some axis has to become valid
+_LOOK_MESSAGES = 10  # in which every axis that there is must be valid once
+_TEST_TIME = 1.0  # s
+
+
+class KvhGyro:
+    """A DSP-1750, DSP-1760, 1750 or 1775; a `drivers.api.Gyro`.
+
+    Parameters
+    ----------
+    link
+        The open line to the unit; the driver closes it.
+    clock
+        The clock that `link` notifies.
+    axis
+        The one axis to use, ``x``, ``y`` or ``z``; empty for all that the unit has.
+    data_rate
+        Samples a second that it must send, None for any.
+    may_set
+        Whether it may be set to that.
+    """
+
+    def __init__(
+        self, link: ByteLink, clock: Clock, *, axis: str = "", data_rate: int | None = None, may_set: bool = False
+    ) -> None:
+        self._clock = clock
+        self._stream = FrameStream(link, clock, decoder(), what="KVH gyro")
+        self._reader = SampleReader(self._stream, clock)
+        self._axis = axis
+        self._data_rate = data_rate
+        self._may_set = may_set
+        self._found: Found | None = None
+        self._axes: list[int] = []
+        self._index = SampleIndex(span=SEQUENCE_SPAN, step=1, sample_rate=1.0)
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples a second, known after `connect`."""
+        return float(self._found.units.data_rate) if self._found else 0.0
+
+    @property
+    def n_axes(self) -> int:
+        """How many input axes a sample holds, 1 or 3, known after `connect`."""
+        return len(self._axes)
+
+    @property
+    def found(self) -> Found:
+        """What the unit says of itself, known after `connect`."""
+        if self._found is None:
+            raise ProtocolError(f"{self._stream.link.name} has not been connected")
+        return self._found
+
+    @property
+    def link_counts(self) -> CrcFrameCounts:
+        """What has come over the link, and what of it could not be used."""
+        return self._stream.counts
+
+    def connect(self) -> DeviceIdentity:
+        """Ask the unit in configuration mode what it is set to, and look which of its axes are there.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            If nothing answers.
+        ProtocolError
+            If it is no such gyro, or sends what cannot be read.
+        DeviceFaultError
+            If it is not set to what is asked for, or has other axes.
+        """
+        self._reader.reset()
+        self._found = configure(self._stream, self._clock, data_rate=self._data_rate, may_set=self._may_set)
+        valid, n_accelerometers = self._look()
+        self._axes = self._choose(valid)
+        kind = "1750 or 1775" if n_accelerometers else "DSP-1750 or DSP-1760"
+        return DeviceIdentity(
+            kind="gyro",
+            model=f"KVH {kind}",
+            serial_number=self._found.serial_number,
+            protocol=f"KVH format {self._found.form}",
+        )
+
+    def self_test(self) -> SelfTest:
+        """Ask for the built-in test; of a unit that has none, look at what its messages say of themselves."""
+        self._stream.link.write(b"?BIT\r\n")
+        deadline = self._clock.now() + _TEST_TIME
+        heard = b""
+        while self._clock.now() < deadline:
+            heard += self._stream.take_raw()
+            failures = find_test(heard)
+            if failures is not None:
+                return SelfTest(failures)
+            self._clock.wait(deadline)
+        valid, _ = self._look()
+        return SelfTest(tuple(f"gyro {'xyz'[axis]} is not valid" for axis in self._axes if axis not in valid))
+
+    def start(self) -> None:
+        """Begin to count samples at 0, with the first that comes from now on."""
+        if self._reader.under_way:
+            return
+        rate, size = self.found.units.data_rate, wire_size(self.found.form)
+        self._stream.drain(bytes_per_second=rate * size)
+        self._index = SampleIndex(span=SEQUENCE_SPAN, step=1, sample_rate=rate)
+        self._reader.begin(self._blocks, sample_rate=rate, frame_size=size, waiting=[])
+
+    def read(self) -> list[RateBlock]:
+        """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.
+
+        Raises
+        ------
+        LinkError
+            If the link is lost.
+        DeviceTimeoutError
+            If the stream has fallen silent.
+        ProtocolError
+            If it sends another format than it said.
+        """
+        return self._reader.read()
+
+    def stop(self) -> None:
+        """Take no more samples; the unit goes on sending. What was sent before can still be read."""
+        self._reader.end()
+
+    def close(self) -> None:
+        """Release the link; the unit goes on sending."""
+        self._reader.reset()
+        self._stream.link.close()
+
+    def _look(self) -> tuple[list[int], int]:
+        """Return which gyros have been valid in some messages, and how many of these had valid accelerometers."""
+        deadline = self._clock.now() + max(_LOOK_TIME, 3 * _LOOK_MESSAGES / self.sample_rate)
+        statuses: list[int] = []
+        while self._clock.now() < deadline:
+            for frames in self._stream.take():
+                statuses += decode_messages(frames)["status"].tolist()
+            gyros = {axis for status in statuses for axis in range(3) if status & GYROS_VALID[axis]}
+            if gyros and len(statuses) >= _LOOK_MESSAGES:
+                return sorted(gyros), sum(status & ACCELEROMETERS_VALID == ACCELEROMETERS_VALID for status in statuses)
+            self._clock.wait(deadline)
+        if statuses:
+            raise DeviceFaultError(f"{self._stream.link.name} says of none of its gyros that it is valid")
+        raise DeviceTimeoutError(f"{self._stream.link.name} has sent no message after it was asked what it is set to")
+
+    def _choose(self, valid: list[int]) -> list[int]:
+        names = ", ".join("xyz"[axis] for axis in valid)
+        if self._axis:
+            if "xyz".index(self._axis) not in valid:
+                raise DeviceFaultError(f"{self._stream.link.name} has no valid gyro {self._axis}, only {names}")
+            return ["xyz".index(self._axis)]
+        if len(valid) == 2:
+            raise DeviceFaultError(f"{self._stream.link.name} has gyros {names}: say which one with axis = 'x'")
+        return valid
+
+    def _blocks(self, frames: list[Frames], now: float) -> tuple[list[RateBlock], DeviceError | None]:
+        """Return messages as blocks, up to what is wrong."""
+        form = self.found.form
+        runs = [decode_messages(run) for run in frames if FORMATS[run.header] == form]
+        failure = None
+        if len(runs) < len(frames):
+            failure = ProtocolError(
+                f"{self._stream.link.name} sends another format than {form}, which it said it sends"
+            )
+        if not runs:
+            return [], failure
+        messages = np.concatenate(runs) if len(runs) > 1 else runs[0]
+        expected = self._index.next_index
+        numbered = self._index.number(messages["sequence"] % SEQUENCE_SPAN, now, damaged=self._stream.damaged())
+        counts = messages["rotation"][:, self._axes].astype(np.float32)
+        status = self._status(messages, counts)
+        longest = max(1, round(LONGEST_BLOCK * self.sample_rate))
+        return [
+            self._block(messages[part.where], counts[part.where], part, status=int(status[part.where.start]), now=now)
+            for part in parts(numbered, status, expected=expected, longest=longest)
+        ], failure
+
+    def _status(self, messages: NDArray[np.void], counts: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Return the status of each message; numbers that are none become 0, in place."""
+        wanted = sum(GYROS_VALID[axis] for axis in self._axes)
+        wrong = messages["status"] & wanted != wanted
+        finite = np.isfinite(counts).all(axis=1)
+        counts[~finite] = 0.0
+        return np.where(wrong | ~finite, GyroStatus.SENSOR_FAULT, GyroStatus.OK).astype(np.uint8)
+
+    def _block(
+        self, messages: NDArray[np.void], counts: NDArray[np.float32], part: Part, *, status: int, now: float
+    ) -> RateBlock:
+        units = self.found.units
+        return RateBlock(
+            first_index=part.first,
+            device_time=part.first / self.sample_rate,
+            arrival_time=now,
+            counts=counts,
+            rate_lsb=units.rate_lsb,
+            temperature=units.celsius(float(messages["temperature"].mean())),
+            specific_force=_specific_force(messages),
+            status=GyroStatus(status) | (GyroStatus.OVERRUN if part.unsure else GyroStatus.OK),
+            n_lost=part.n_lost,
+        )
+
+
+def _specific_force(messages: NDArray[np.void]) -> tuple[float, float, float] | None:
+    """Return the mean of the accelerometers in m/s^2, None if there are none or they are not valid."""
+    if (messages["status"] & ACCELEROMETERS_VALID != ACCELEROMETERS_VALID).any():
+        return None
+    x, y, z = (messages["acceleration"].astype(np.float64).mean(axis=0) * STANDARD_GRAVITY).tolist()
+    return x, y, z
