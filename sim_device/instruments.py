@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 from sim_device.firmware.gyro import GyroDevice
+from sim_device.firmware.kvh import KvhDevice
 from sim_device.firmware.stage import StageDevice
 from sim_device.firmware.stim300 import Stim300Device
 from sim_device.plant.boards import SimGyroBoard, SimStageBoard
@@ -64,6 +65,7 @@ class Instrument(Generic[BoardT]):
 
 
 GYROS: dict[str, Instrument[SimGyroBoard]] = {
+    "kvh": Instrument(KvhDevice, profile="kvh"),
     "native": Instrument(GyroDevice, acknowledges=True),
     "stim300": Instrument(Stim300Device, profile="stim300"),
 }
