@@ -34,6 +34,9 @@ class Clock(Protocol):
         Look at the links first, then wait: what has come since the last `wait` ends the next one at once.
         """
 
+    def alarm(self, instant: float) -> None:
+        """End the next `wait` at `instant` at the latest. For drivers that have to ask again soon by themselves."""
+
     def notify(self) -> None:
         """End the present `wait`, or else the next one. For links, which may call it from any thread."""
 

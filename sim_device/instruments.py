@@ -13,6 +13,7 @@ from sim_device.firmware.gyro import GyroDevice
 from sim_device.firmware.kvh import KvhDevice
 from sim_device.firmware.stage import StageDevice
 from sim_device.firmware.stim300 import Stim300Device
+from sim_device.firmware.zaber import ZaberDevice
 from sim_device.plant.boards import SimGyroBoard, SimStageBoard
 
 BoardT = TypeVar("BoardT")
@@ -71,6 +72,7 @@ GYROS: dict[str, Instrument[SimGyroBoard]] = {
 }
 STAGES: dict[str, Instrument[SimStageBoard]] = {
     "native": Instrument(StageDevice, acknowledges=True),
+    "zaber": Instrument(ZaberDevice),
 }
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import degrees
 
 from construct import Container
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, SelfTest, StageLimits, StageMode, StageState
 from drivers.errors import DeviceError, DeviceTimeoutError, LinkError, ProtocolError
+from drivers.limits import narrowed, require_within
 from drivers.native.refusal import fault_name
 from drivers.native.self_test import run_self_test
 from drivers.native.session import HEARTBEAT_PERIOD, LinkCounts, Session, random_session
@@ -96,7 +96,7 @@ class NativeStage:
         identity = self._session.open()
         config = self._session.request(MessageType.GET_CONFIG, reply=MessageType.STAGE_CONFIG)
         self._status_period = config.status_period_ms / 1000
-        self._limits = _narrowed(_limits(config), self._own_limits)
+        self._limits = narrowed(_limits(config), self._own_limits)
         deadline = self._clock.now() + MAX_SILENCE_AT_REST
         while not self._refresh():
             now = self._clock.now()
@@ -131,10 +131,11 @@ class NativeStage:
             If the device refuses.
         """
         limits = self.limits
-        _require("azimuth", azimuth, limits.azimuth_min, limits.azimuth_max, "deg")
-        _require("elevation", elevation, limits.elevation_min, limits.elevation_max, "deg")
         speed = limits.max_speed if speed is None else speed
-        _require("speed", speed, ANGLE_LSB, limits.max_speed, "deg/s")
+        half = ANGLE_LSB / 2
+        require_within("azimuth", azimuth, limits.azimuth_min, limits.azimuth_max, unit="deg", slack=half)
+        require_within("elevation", elevation, limits.elevation_min, limits.elevation_max, unit="deg", slack=half)
+        require_within("speed", speed, ANGLE_LSB, limits.max_speed, unit="deg/s", slack=half)
         speed_counts = round(speed / ANGLE_LSB)
         self._session.request(
             MessageType.MOVE,
@@ -248,29 +249,3 @@ def _limits(config: Container) -> StageLimits:
         max_speed=config.max_speed * ANGLE_LSB,
         max_acceleration=config.max_acceleration * ANGLE_LSB,
     )
-
-
-def _narrowed(device: StageLimits, own: StageLimits | None) -> StageLimits:
-    """Return what both the device and the host allow."""
-    if own is None:
-        return device
-    both = StageLimits(
-        azimuth_min=max(device.azimuth_min, own.azimuth_min),
-        azimuth_max=min(device.azimuth_max, own.azimuth_max),
-        elevation_min=max(device.elevation_min, own.elevation_min),
-        elevation_max=min(device.elevation_max, own.elevation_max),
-        max_speed=min(device.max_speed, own.max_speed),
-        max_acceleration=device.max_acceleration,
-    )
-    if both.azimuth_min > both.azimuth_max or both.elevation_min > both.elevation_max or both.max_speed <= 0:
-        raise ValueError("the limits asked for leave the stage nowhere to go within its own")
-    return both
-
-
-def _require(name: str, value: float, least: float, most: float, unit: str) -> None:
-    """Raise ValueError unless `value` lies between `least` and `most`, to half a count."""
-    if not least - ANGLE_LSB / 2 <= value <= most + ANGLE_LSB / 2:
-        raise ValueError(
-            f"{name} {degrees(value):.4f} {unit} lies outside the stage's limits, "
-            f"{degrees(least):.4f} to {degrees(most):.4f} {unit}"
-        )

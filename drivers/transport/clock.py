@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from contextlib import suppress
@@ -13,6 +14,7 @@ class SystemClock:
     def __init__(self) -> None:
         self._no_news = threading.Lock()  # held while there is none: a third of an Event's cost a wait
         self._no_news.acquire()
+        self._alarm = math.inf
 
     def now(self) -> float:
         """Return the present instant in seconds."""
@@ -24,8 +26,13 @@ class SystemClock:
             time.sleep(duration)
 
     def wait(self, deadline: float) -> None:
-        """Return at `deadline`, or as soon as a link has called `notify` since the last wait."""
+        """Return at `deadline` or the `alarm`, or as soon as a link has called `notify` since the last wait."""
+        deadline, self._alarm = min(deadline, self._alarm), math.inf
         self._no_news.acquire(timeout=min(max(0.0, deadline - self.now()), threading.TIMEOUT_MAX))
+
+    def alarm(self, instant: float) -> None:
+        """End the next `wait` at `instant` at the latest."""
+        self._alarm = min(self._alarm, instant)
 
     def notify(self) -> None:
         """End the present `wait`, or else the next one."""

@@ -5,7 +5,7 @@ A whole measurement runs in it inside a test, with the very drivers that talk to
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, inf
 from typing import Protocol
 
 from drivers.errors import LinkError
@@ -46,6 +46,7 @@ class VirtualClock:
     def __init__(self) -> None:
         self._now_us = 0
         self._news = False
+        self._alarm = inf
         self._links: list[_Acting] = []
 
     @property
@@ -65,10 +66,15 @@ class VirtualClock:
 
     def wait(self, deadline: float) -> None:
         """Let time pass until something new has arrived on any link, a link has failed, or `deadline` has come."""
+        deadline, self._alarm = min(deadline, self._alarm), inf
         end_us = _round_up_us(deadline)
         while not self._news and self._step(end_us):
             pass
         self._news = False
+
+    def alarm(self, instant: float) -> None:
+        """End the next `wait` at `instant` at the latest."""
+        self._alarm = min(self._alarm, instant)
 
     def notify(self) -> None:
         """End the present `wait`, or else the next one."""
