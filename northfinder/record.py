@@ -7,6 +7,7 @@ s, angles in rad, rates in rad/s per count. Every row is checked against its sea
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -37,6 +38,8 @@ _ALL_STATUS = sum(GyroStatus)
 _STATUS = {int(status): status for status in (GyroStatus.OK, GyroStatus.OVERRUN)}  # the usual ones, quickly
 _ANY_INDEX = (0, 1 << 62)
 _FETCHED = 64  # rows at a time
+#: The entry of meta that a closed record has: how many rows each table held before it, but for notes.
+CLOSED = "closed"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +79,9 @@ def one_line(path: Path, doing: str) -> Iterator[None]:
     """Turn SQLite's exceptions into one sentence about the record."""
     try:
         yield
-    except sqlite3.Error as error:
-        raise RecordError(f"the record {path} cannot be {doing}: {error}") from error
+    except (sqlite3.Error, UnicodeError) as error:  # damaged text, even that of SQLite's own complaint
+        hint = "; northfinder recover saves the rest" if type(error) is sqlite3.DatabaseError else ""
+        raise RecordError(f"the record {path} cannot be {doing}: {error}{hint}") from error
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
@@ -96,7 +100,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         except sqlite3.OperationalError:  # it could be one, but not here: no rights, no room beside it
             db.close()
             raise
-        except sqlite3.DatabaseError:
+        except (sqlite3.DatabaseError, UnicodeError):
             db.close()
             raise RecordError(f"{path} is no record of a measurement") from None
     if application_id != APPLICATION_ID or version != SCHEMA_VERSION:
@@ -116,6 +120,7 @@ class Record:
         """Open the file `path`. Raises RecordError if it is no record of a version this program knows."""
         self.path = path
         self._db = open_for_reading(path)
+        self._closed_with: dict[str, int] | None = None
 
     def __enter__(self) -> Self:
         """Return the record itself."""
@@ -151,6 +156,15 @@ class Record:
                     raise self._damaged(f"row {altered} of {table} does not match its checksum")
                 number += len(rows)
                 yield rows
+        if table != "meta" and number <= self._closing().get(table, 0) and (stop is None or number < stop):
+            raise self._damaged(f"row {number} of {table} is missing")
+
+    def _closing(self) -> dict[str, int]:
+        """Return how many rows each table had when the record was closed last, nothing if it never was."""
+        if self._closed_with is None:
+            found = self.meta(CLOSED)
+            self._closed_with = found if isinstance(found, dict) else {}
+        return self._closed_with
 
     def count(self, table: str) -> int:
         """Return how many rows `table` has, by the number of its last one."""
@@ -206,8 +220,9 @@ class Record:
         for row in self.rows("block", first):
             if stream is not None and (row[1], row[2]) >= (stream, stop_index):
                 return
-            if row[2] < stop_index and row[2] + row[3] > first_index:
-                yield self._block(row)
+            block = self._block(row)
+            if block.first_index < stop_index and block.first_index + len(block.counts) > first_index:
+                yield block
 
     def blocks_of(self, span: DwellSpan) -> Iterator[RateBlock]:
         """Yield the blocks that hold the samples of a dwell, in order."""
@@ -252,8 +267,8 @@ class Record:
 
     def _counts(self, rows: Sequence[Row]) -> RateCounts:
         """Return the counts of blocks of one form, joined. Raises RecordError if any are none."""
-        for number, _, _, n_samples, n_axes, _, _, lsb, dtype, *_, status, n_lost, data, _ in rows:
-            possible = dtype in _DTYPES and None not in {lsb, status, n_lost, data} and n_axes and n_axes > 0
+        for number, _, first, n_samples, n_axes, _, _, _, dtype, *_, status, n_lost, data, _ in rows:
+            possible = dtype in _DTYPES and n_axes > 0 and min(first, status, n_lost) >= 0
             if not possible or not 0 < len(data) == 4 * n_samples * n_axes <= MAX_BLOCK_BYTES:
                 raise self._damaged(f"row {number} of block is no block of samples")
             if (n_axes, dtype) != (rows[0][4], rows[0][8]):
@@ -282,8 +297,9 @@ class Record:
         try:
             return [
                 StageState(
-                    device_time=row[2], arrival_time=row[3], mode=StageMode(row[4]), azimuth=row[5], elevation=row[6],
-                    azimuth_rate=row[7], elevation_rate=row[8], in_position=bool(row[9]), fault=row[10],
+                    device_time=row[2], arrival_time=row[3], mode=StageMode(row[4]), azimuth=_number(row[5]),
+                    elevation=_number(row[6]), azimuth_rate=_number(row[7]), elevation_rate=_number(row[8]),
+                    in_position=bool(row[9]), fault=row[10],
                 )
                 for row in self.rows("stage_state")
             ]  # fmt: skip
@@ -307,6 +323,10 @@ class Record:
     def fixes(self) -> list[Any]:
         """Return what was estimated, oldest first."""
         return [self._decoded(value, f"fix {number}") for number, _, value in self.rows("fix")]
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _columns(rows: Sequence[Row], counts: RateCounts) -> BlockColumns:

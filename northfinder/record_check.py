@@ -47,7 +47,7 @@ def examine(path: Path) -> Examination:
 def _examine_file(db: sqlite3.Connection, found: Examination) -> None:
     try:
         messages = [row[0] for row in db.execute(f"PRAGMA quick_check({_MAX_NAMED})")]
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:
         messages = [str(error)]
     found.damage += [f"SQLite says: {message}" for message in messages if message != "ok"]
 
@@ -55,9 +55,8 @@ def _examine_file(db: sqlite3.Connection, found: Examination) -> None:
 def _examine_table(db: sqlite3.Connection, table: str, found: Examination) -> int:
     """Check the rows of a table; return the number of the last one."""
     missing, altered, last, previous = [], [], 0, None
-    rows = db.execute(f"SELECT {NAMES[table]} FROM {table} ORDER BY id")  # noqa: S608  # names of ours
     try:
-        for row in rows:
+        for row in db.execute(f"SELECT {NAMES[table]} FROM {table} ORDER BY id"):  # noqa: S608  # names of ours
             if not isinstance(row[0], int) or row[0] <= last:
                 altered.append(f"row {row[0]} of {table} stands after row {last}")
                 continue
@@ -71,7 +70,7 @@ def _examine_table(db: sqlite3.Connection, table: str, found: Examination) -> in
             if table == "block":
                 found.notes += _gap(previous, row, found)
                 previous = row
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeError) as error:
         altered.append(f"{table} cannot be read beyond row {last}: {error}")
     for sentences in (missing, altered):
         found.damage += sentences[:_MAX_NAMED]
@@ -95,7 +94,7 @@ def _examine_end(db: sqlite3.Connection, last: dict[str, int], found: Examinatio
     """Compare with what the record held when it was closed."""
     try:
         counts = closing_counts(row[0] for row in db.execute("SELECT value FROM meta WHERE key = 'closed' ORDER BY id"))
-    except sqlite3.Error:
+    except (sqlite3.Error, UnicodeError):
         return  # said already
     if written:
         found.notes.append("it is being written")

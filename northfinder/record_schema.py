@@ -38,12 +38,16 @@ class Column:
     name: str
     kind: Kind
     unit: str = ""
+    optional: bool = False  #: whether a row may have no value there: it was not measured, or is no number
 
 
 def _columns(text: str) -> tuple[Column, ...]:
-    """Return columns written as ``name KIND unit`` a line."""
-    parts = (line.split(maxsplit=2) for line in text.strip().splitlines())
-    return tuple(Column(name, kind, *unit) for name, kind, *unit in parts)  # type: ignore[arg-type]  # words of ours
+    """Return columns written as ``name KIND unit`` a line, with a ``?`` after the kind of those that are optional."""
+    parts = (line.split() for line in text.strip().splitlines())
+    return tuple(
+        Column(name, kind.rstrip("?"), "".join(unit), kind.endswith("?"))  # type: ignore[arg-type]  # words of ours
+        for name, kind, *unit in parts
+    )
 
 
 #: The columns of each table; before them stands ``id``, after them ``crc``.
@@ -68,12 +72,12 @@ TABLES: dict[str, tuple[Column, ...]] = {
         arrival_time REAL s
         rate_lsb REAL rad/s
         dtype TEXT
-        temperature REAL degC
-        tilt_x REAL rad
-        tilt_y REAL rad
-        specific_force_x REAL m/s^2
-        specific_force_y REAL m/s^2
-        specific_force_z REAL m/s^2
+        temperature REAL? degC
+        tilt_x REAL? rad
+        tilt_y REAL? rad
+        specific_force_x REAL? m/s^2
+        specific_force_y REAL? m/s^2
+        specific_force_z REAL? m/s^2
         status INTEGER
         n_lost INTEGER
         counts BLOB"""),
@@ -82,10 +86,10 @@ TABLES: dict[str, tuple[Column, ...]] = {
         device_time REAL s
         arrival_time REAL s
         mode TEXT
-        azimuth REAL rad
-        elevation REAL rad
-        azimuth_rate REAL rad/s
-        elevation_rate REAL rad/s
+        azimuth REAL? rad
+        elevation REAL? rad
+        azimuth_rate REAL? rad/s
+        elevation_rate REAL? rad/s
         in_position INTEGER
         fault TEXT"""),
     "step": _columns("""
@@ -150,7 +154,8 @@ _CASTS: dict[Kind, Callable[[Any], Any]] = {"INTEGER": _integer, "REAL": _real, 
 _TABLE_CASTS = {table: tuple(_CASTS[column.kind] for column in columns) for table, columns in TABLES.items()}
 _TYPES: dict[Kind, type] = {"INTEGER": int, "REAL": float, "TEXT": str, "BLOB": bytes}
 _TABLE_TYPES = {
-    table: tuple({_TYPES[column.kind], type(None)} for column in columns) for table, columns in TABLES.items()
+    table: tuple({_TYPES[column.kind]} | ({type(None)} if column.optional else set()) for column in columns)
+    for table, columns in TABLES.items()
 }
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -164,7 +169,16 @@ def sealed(table: str, number: int, values: Iterable[Any]) -> Row:
     """Return the row as it is kept: number, values in their kinds, checksum. Raises RecordError for what cannot be."""
     cast = _TABLE_CASTS[table]
     row = (number, *(None if v is None else c(v) for c, v in zip(cast, values, strict=True)))
+    if None in row:
+        _check_values(table, row)
     return (*row, checksum(table, row))
+
+
+def _check_values(table: str, row: Row) -> None:
+    """Raise RecordError if a value is missing that must be there."""
+    for column, value in zip(TABLES[table], row[1:], strict=True):
+        if value is None and not column.optional:
+            raise RecordError(f"{column.name} of {table} has no value, or is no number: it cannot be recorded")
 
 
 def is_sound(table: str, row: Row) -> bool:

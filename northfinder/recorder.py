@@ -19,13 +19,11 @@ import numpy as np
 from drivers.api import DeviceIdentity, RateBlock, StageState
 from northfinder import record_writer
 from northfinder.errors import RecordError
-from northfinder.record import DwellSpan, Record
+from northfinder.record import CLOSED, DwellSpan, Record
 from northfinder.record_schema import MAX_BLOCK_BYTES, TABLES, Row, sealed
 
 #: What has arrived is handed to the file at least this often, in s.
 WRITE_PERIOD = 0.1
-#: The entry of meta that a closed record has: how many rows each table held before it, but for notes.
-CLOSED = "closed"
 #: What a row takes beside its counts, a state of the stage, how often one comes, and what a record takes besides.
 _ROW_BYTES, _STATE_BYTES, _STATES_PER_S, _OTHER_BYTES = 110, 110, 10.0, 24_000_000
 #: The shortest block that a gyro is expected to send, in samples; shorter ones take more room.

@@ -79,7 +79,7 @@ def test_a_record_returns_what_was_put_in(tmp_path: Path) -> None:
     counts=st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=300),
     floats=st.booleans(),
 )
-@settings(max_examples=40)
+@settings(max_examples=12)
 def test_counts_survive_bit_for_bit(tmp_path_factory: pytest.TempPathFactory, counts: list[int], floats: bool) -> None:  # noqa: FBT001
     """Any int32, and any float32 a gyro may send, comes back exactly."""
     path = tmp_path_factory.mktemp("record") / "north.sqlite"
