@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from northfinder.record import open_for_reading
+from northfinder.record import CLOSED, open_for_reading
 from northfinder.record_lock import is_being_written
 from northfinder.record_recovery import closing_counts
 from northfinder.record_schema import NAMES, TABLES, Row, is_sound
@@ -93,7 +93,9 @@ def _gap(previous: Row | None, row: Row, found: Examination) -> Iterator[str]:
 def _examine_end(db: sqlite3.Connection, last: dict[str, int], found: Examination, *, written: bool) -> None:
     """Compare with what the record held when it was closed."""
     try:
-        counts = closing_counts(row[0] for row in db.execute("SELECT value FROM meta WHERE key = 'closed' ORDER BY id"))
+        counts = closing_counts(
+            row[0] for row in db.execute("SELECT value FROM meta WHERE key = ? ORDER BY id", (CLOSED,))
+        )
     except (sqlite3.Error, UnicodeError):
         return  # said already
     if written:

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from northfinder.errors import RecordError
+from northfinder.record import CLOSED
 from northfinder.record_pages import scan
 from northfinder.record_schema import INSERT, NAMES, SCHEMA, TABLES, sealed
 from northfinder.record_writer import create, finish
@@ -79,7 +80,7 @@ def _collect(path: Path, sorter: sqlite3.Connection) -> None:
 
 
 def _tally(sorter: sqlite3.Connection) -> Salvage:
-    counts = closing_counts(row[2] for row in sorter.execute("SELECT * FROM meta WHERE key = 'closed' ORDER BY id"))
+    counts = closing_counts(row[2] for row in sorter.execute("SELECT * FROM meta WHERE key = ? ORDER BY id", (CLOSED,)))
     found, lost = {}, {}
     for table in TABLES:
         numbers = (row[0] for row in sorter.execute(f"SELECT id FROM {table} ORDER BY id"))  # noqa: S608  # names of ours
@@ -113,19 +114,30 @@ def _missing(numbers: Iterator[int], n_expected: int) -> tuple[int, tuple[tuple[
 
 
 def _write(sorter: sqlite3.Connection, out: Path, sentences: list[str]) -> None:
+    """Write the rows found to a new record, numbered anew, and what became of the old one as an event."""
     db, lock = create(out)
     try:
-        for table in TABLES:
-            numbered = enumerate(sorter.execute(f"SELECT {NAMES[table]} FROM {table} ORDER BY id"), 1)  # noqa: S608
-            rows = (sealed(table, number, row[1:-1]) for number, row in numbered)
-            while batch := list(islice(rows, _BATCH)):
-                db.execute("BEGIN")
-                db.executemany(INSERT[table], batch)
-                db.execute("COMMIT")
-        number = db.execute("SELECT count(*) + 1 FROM event").fetchone()[0]
+        sorter.execute("DELETE FROM meta WHERE key = ?", (CLOSED,))  # its numbers are not those of the new record
+        counts = {table: _copy(sorter, db, table) for table in TABLES}
         time = db.execute("SELECT max(time) FROM event").fetchone()[0] or 0.0
-        db.execute(INSERT["event"], sealed("event", number, (0, time, "recovered", "; ".join(sentences))))
+        counts["event"] += 1
+        db.execute(INSERT["event"], sealed("event", counts["event"], (0, time, "recovered", "; ".join(sentences))))
+        closing = msgspec.json.encode(counts).decode()
+        db.execute(INSERT["meta"], sealed("meta", counts["meta"] + 1, (CLOSED, closing)))
         finish(db)
     finally:
         db.close()
         lock.release()
+
+
+def _copy(sorter: sqlite3.Connection, db: sqlite3.Connection, table: str) -> int:
+    """Copy the rows of a table; return how many there are."""
+    n_rows = 0
+    found = sorter.execute(f"SELECT {NAMES[table]} FROM {table} ORDER BY id")  # noqa: S608  # names of ours
+    rows = (sealed(table, number, row[1:-1]) for number, row in enumerate(found, 1))
+    while batch := list(islice(rows, _BATCH)):
+        db.execute("BEGIN")
+        db.executemany(INSERT[table], batch)
+        db.execute("COMMIT")
+        n_rows += len(batch)
+    return n_rows
