@@ -550,6 +550,7 @@ class TestSettings:
         board = TriadBoard()
         board.sample_rate_millihz = 2_000_000
         rig = Rig(board)
+        rig.device.bit_rate_code = 1
         with pytest.raises(DeviceFaultError, match="42 bytes 2000 times a second, too many for 460800"):
             rig.gyro.connect()
 

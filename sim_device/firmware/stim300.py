@@ -39,7 +39,6 @@ class Stim300Device:
     output = RATE
     terminated = False  # whether CR LF ends each datagram
     old_ids = False  # of a unit with AUX instead of PPS
-    bit_rate_code = 1  # 460800
     told_time_us = -1
     testing = False
 
@@ -51,6 +50,7 @@ class Stim300Device:
         self.seen_time_us = 0
         self._board = board
         self._rate = rate
+        self.bit_rate_code = 1 if rate <= 500 else 2  # 460800 or 921600
         self._batch = rate // 125  # samples sent together
         self._line = b""
         self._answers: list = []  # type: ignore[type-arg]  # datagrams that take the place of samples
