@@ -4,6 +4,8 @@ find     wall time and memory of a whole ``find --speed max``, both processes' s
 decode   bytes of the wire to arrays
 live     processor time of transport, driver and record at 2,000 samples/s of three axes
 estimate time of an estimate from 16 min and from 24 h of 1 s means
+stim300  frames a second decoded; processor time of transport, driver and record at 2,000 samples/s
+kvh      frames a second decoded
 plan     wall time of ``northfinder plan`` with its plot
 help     wall time of ``northfinder --help``
 """
@@ -22,6 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from bench_gyros import bench_kvh, bench_stim300
 
 from drivers.api import ByteLink
 from drivers.native import NativeGyro, open_gyro
@@ -44,6 +47,9 @@ LIMITS = {
     "live_cpu_percent": 5.0,
     "estimate_16_min_s": 0.03,
     "estimate_24_h_s": 2.0,
+    "stim300_frames_per_s": 5e5,
+    "stim300_live_cpu_percent": 6.0,
+    "kvh_frames_per_s": 5e5,
     "plan_wall_s": 5.0,
     "help_wall_s": 0.5,
 }
@@ -188,6 +194,8 @@ BENCHES: dict[str, Callable[[], dict[str, float]]] = {
     "decode": bench_decode,
     "live": bench_live,
     "estimate": bench_estimate,
+    "stim300": bench_stim300,
+    "kvh": bench_kvh,
     "plan": bench_plan,
     "help": bench_help,
 }
