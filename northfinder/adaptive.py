@@ -64,6 +64,10 @@ class AdaptivePlan:
         """How many steps it has; 0 before the stage is known."""
         return 0 if self._designed is None else len(self._designed.cyclogram.steps)
 
+    def step_names(self) -> tuple[str, ...]:
+        """Return the names of all steps; none before the stage is known."""
+        return () if self._designed is None else tuple(step.name for step in self._designed.cyclogram.steps)
+
     def check(self, limits: StageLimits) -> None:
         """Design the plan for this stage. Raises ConfigError if the stage or the time does not do for it."""
         self._designed = self.design(Turns.of_stage(limits, self.settle))

@@ -1,24 +1,24 @@
-"""What an operator sees while a measurement runs: a live table on a terminal, plain lines elsewhere, on stderr."""
+"""What an operator sees while a measurement runs: a live picture on a terminal, plain lines elsewhere, on stderr."""
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
 
 from rich.console import Console
 from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
 
 from drivers.api import Clock
+from northfinder.cli.live_view import LiveView, countdown
 from northfinder.estimation import Fix
 from northfinder.sequencer import Progress, State
-from northfinder.units import DPH
+from northfinder.text import printable
 
 #: Host time between two pictures, in s.
-REFRESH_PERIOD = 0.1
+REFRESH_PERIOD = 0.25
 
 
 class Display(Protocol):
@@ -32,46 +32,26 @@ class Display(Protocol):
 
 
 class LiveDisplay:
-    """A table that is drawn anew in place."""
+    """A picture that is drawn anew in place."""
 
-    def __init__(self, live: Live, clock: Clock) -> None:
-        """Draw on `live`, at most each REFRESH_PERIOD by `clock`."""
+    def __init__(self, live: Live, clock: Clock, view: LiveView) -> None:
+        """Draw `view` on `live`, at most each REFRESH_PERIOD by `clock`."""
         self._live = live
         self._clock = clock
+        self._view = view
         self._next = -math.inf
 
     def show(self, progress: Progress, fix: Fix | None) -> None:
-        """Draw the table."""
+        """Take note of it, and draw it if it is time."""
         now = self._clock.now()
-        if now < self._next:
-            return
-        self._next = now + REFRESH_PERIOD
-        self._live.update(self._table(progress, fix), refresh=True)
+        self._view.note(progress, fix, now)
+        if now >= self._next:
+            self._next = now + REFRESH_PERIOD
+            self._live.update(self._view.picture(progress, now), refresh=True)
 
     def say(self, text: str) -> None:
-        """Print it above the table."""
+        """Print it above the picture."""
         self._live.console.print(text)
-
-    def _table(self, progress: Progress, fix: Fix | None) -> Table:
-        table = Table.grid(padding=(0, 2))
-        step = progress.step
-        number = min(progress.n_done + 1, progress.n_steps)
-        name = "" if step is None else f"{step.name}, step {number} of {progress.n_steps}"
-        table.add_row("state", f"{progress.state.value} {name}")
-        if progress.state is State.DWELL and step is not None:
-            table.add_row("dwell", ProgressBar(total=1.0, completed=progress.step_fraction, width=40))
-        table.add_row("to go", f"{countdown(progress.remaining)} of dwell")
-        if progress.rate is not None:
-            table.add_row("rate", f"{progress.rate / DPH:+.2f} deg/h")
-        if progress.stage is not None:
-            table.add_row(
-                "stage",
-                f"azimuth {math.degrees(progress.stage.azimuth):.3f}, "
-                f"elevation {math.degrees(progress.stage.elevation):.3f} deg",
-            )
-        table.add_row("samples", f"{progress.n_samples}, {progress.n_lost} lost")
-        table.add_row("azimuth", "not yet known" if fix is None else azimuth_text(fix))
-        return table
 
 
 class PlainDisplay:
@@ -88,7 +68,9 @@ class PlainDisplay:
         self._last = (progress.state, progress.n_done)
         line = progress.state.value
         if progress.state is State.DWELL and progress.step is not None:
-            line = f"dwell {progress.n_done + 1} at {progress.step.name}, {countdown(progress.remaining)} to go"
+            line = (
+                f"dwell {progress.n_done + 1} at {printable(progress.step.name)}, {countdown(progress.remaining)} to go"
+            )
             line += "" if fix is None else f", azimuth {azimuth_text(fix)}"
         print(line, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
 
@@ -111,15 +93,26 @@ class SilentDisplay:
 class DisplayContext(AbstractContextManager[Display]):
     """Chooses the display for this terminal, and takes it down at the end."""
 
-    def __init__(self, clock: Clock, *, quiet: bool) -> None:
-        """Prepare; nothing is drawn yet."""
-        console = Console(stderr=True)
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        quiet: bool,
+        step_names: Callable[[], Sequence[str]] = tuple,
+        time: float | None = None,
+        console: Console | None = None,
+    ) -> None:
+        """Prepare, draw nothing yet.
+
+        `step_names` tells the plan's steps, `time` how long it may take, s; `console` is standard error by default.
+        """
+        console = console or Console(stderr=True)
         live = console.is_terminal and not quiet
         self._live = Live(console=console, auto_refresh=False, transient=True) if live else None
         self._context: AbstractContextManager[object] = self._live or nullcontext()
         self._display: Display = SilentDisplay() if quiet else PlainDisplay()
         if self._live is not None:
-            self._display = LiveDisplay(self._live, clock)
+            self._display = LiveDisplay(self._live, clock, LiveView(step_names, time))
 
     def __enter__(self) -> Display:
         """Put the display up."""
@@ -134,13 +127,3 @@ class DisplayContext(AbstractContextManager[Display]):
 def azimuth_text(fix: Fix) -> str:
     """Return the azimuth as an operator reads it."""
     return f"{math.degrees(fix.azimuth):.3f} ± {math.degrees(fix.azimuth_sd):.3f} deg"
-
-
-def countdown(seconds: float) -> str:
-    """Return a span as minutes and seconds.
-
-    >>> countdown(125.2)
-    '2:05'
-    """
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"

@@ -106,7 +106,8 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
         if truth is not None:
             config = _emulated(config, stack.enter_context(EmulatorProcess(truth)))
         stop_requested = stack.enter_context(stop_on_signal(clock))
-        display = stack.enter_context(Aside(DisplayContext(clock, quiet=options.quiet)))
+        shown = DisplayContext(clock, quiet=options.quiet, step_names=plan.step_names, time=plan.time)
+        display = stack.enter_context(Aside(shown))
         results: list[dict[str, Any]] = []
         for _ in range(options.repeat):
             begun = time.monotonic() if results else STARTED
