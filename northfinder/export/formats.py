@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,19 +26,18 @@ def export_record(record: Record, out: Path, kind: str) -> int:
 
     Raises RecordError if `out` exists or cannot be written, or the record is damaged; nothing is left behind then.
     """
-    part = out.with_name(out.name + ".part")
     if out.exists():
         raise RecordError(f"{out} exists already: nothing is overwritten")
+    part = out.with_name(out.name + ".part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         n_samples = FORMATS[kind](record, part)
         part.rename(out)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise RecordError(f"{out} cannot be written: {error.strerror or error}") from None
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
     return n_samples
 
 
