@@ -50,6 +50,7 @@ class Recorder:
         self.n_samples = 0
         self.n_lost = 0
         self.stream = 0  #: number of the gyro's stream that is being recorded
+        self.resumed = resume  #: whether it goes on with what was interrupted
         self._next_row = dict.fromkeys(TABLES, 1)
         if resume:
             with Record(path) as record:

@@ -242,7 +242,7 @@ class Sequencer:
     def _home(self) -> Event:
         gyro, stage = self._devices()
         state = self._service_stage()
-        if self.recorder.stream and state.mode is StageMode.FAULT and state.fault in HOST_SILENT:
+        if self.recorder.resumed and state.mode is StageMode.FAULT and state.fault in HOST_SILENT:
             state = self._rearm(stage, state.fault)
         if state.mode is not StageMode.IDLE:
             stage.home()
