@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 from drivers.api import ByteLink, Clock, RateBlock
 from drivers.errors import DeviceError, DeviceTimeoutError, LinkError, ProtocolError
-from drivers.protocol.crc_frames import CrcFrameCounts, CrcFrameDecoder, Frames
+from drivers.protocol.crc_frames import CrcFrameCounts, Frames
 
 BATCH_TIME = 0.2  # s of samples that are decoded together
 LONGEST_BLOCK = 0.25  # s
@@ -14,7 +15,23 @@ MAX_SILENCE = 1.0  # s, or three samples if that is longer
 _DRAIN_TIME = 0.06  # s, more than a reader of a port that was full takes to read on
 _DRAIN_SLACK = 256  # bytes
 _MAX_DRAINS = 20
+_LONGEST_SIGN = 15  # bytes, less one
 _LONGEST_HOLD = 0.25  # s for which bytes wait for more of them
+
+
+class FrameDecoder(Protocol):
+    """Turns bytes into frames; see `drivers.protocol.crc_frames.CrcFrameDecoder`."""
+
+    @property
+    def counts(self) -> CrcFrameCounts:
+        """A copy of what it has met so far."""
+
+    def feed(self, data: bytes) -> list[Frames]:
+        """Return the good frames that `data` completes."""
+
+
+#: Whether bytes hold what is looked for.
+Sign = Callable[[bytes], bool]
 
 
 class FrameStream:
@@ -30,13 +47,20 @@ class FrameStream:
         Of the frames.
     what
         The instrument, for messages.
+    sign
+        Whether bytes hold what the instrument sends besides its frames, at most 16 bytes; counted in `n_signs`.
     """
 
-    def __init__(self, link: ByteLink, clock: Clock, decoder: CrcFrameDecoder, *, what: str) -> None:
+    def __init__(
+        self, link: ByteLink, clock: Clock, decoder: FrameDecoder, *, what: str, sign: Sign = lambda _: False
+    ) -> None:
         self.link = link
         self._clock = clock
         self._decoder = decoder
         self._what = what
+        self._sign = sign
+        self._tail = b""  # in which a sign may have begun
+        self.n_signs = 0  #: how many batches have held one
         self._pending: list[bytes] = []
         self._n_pending = 0
         self._pending_since = 0.0
@@ -75,6 +99,9 @@ class FrameStream:
         data = b"".join(self._pending)
         self._pending.clear()
         self._n_pending = 0
+        if self._sign is not None:
+            self.n_signs += self._sign(self._tail + data)
+            self._tail = data[-_LONGEST_SIGN:]
         return self._decoder.feed(data)
 
     def take_raw(self) -> bytes:
@@ -83,6 +110,7 @@ class FrameStream:
         data = b"".join(self._pending)
         self._pending.clear()
         self._n_pending = 0
+        self._tail = b""
         return data
 
     def drain(self, *, bytes_per_second: float) -> None:

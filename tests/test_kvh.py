@@ -167,6 +167,17 @@ class TestFirmware:
         (frames,) = decoder().feed(device.poll(930_000))
         assert decode_messages(frames)["status"].tolist() == [0x70, 0x70, 0x77, 0x77]
 
+    @given(st.lists(st.binary(max_size=30), max_size=10), st.booleans())
+    def test_any_text(self, lines: list[bytes], configuring: bool) -> None:  # noqa: FBT001  # drawn
+        """Whatever comes over the line, the unit lives, and streams when it is told to."""
+        device = KvhDevice(SlowBoard())
+        device.poll(500_000)
+        for line in [b"=CONFIG,1\n"] * configuring + lines:
+            device.feed(line + b"\r\n", 600_000)
+            device.poll(600_000)
+        device.feed(b"\n=CONFIG,0\n", 700_000)
+        assert decoder().feed(device.poll(800_000))
+
     def test_a_full_line_loses_whole_messages(self) -> None:
         """What has no room is left out as a whole, and its number with it."""
         device = KvhDevice(SlowBoard())
@@ -331,6 +342,16 @@ class TestDriver:
         with pytest.raises(ProtocolError, match="another format than A"):
             rig.run(1.0)
 
+    def test_reset(self) -> None:
+        """A unit that starts anew tells of its test, which is a fault."""
+        rig = Rig().started()
+        rig.run(1.0)
+        began = rig.clock.now_us
+        fresh = KvhDevice(rig.board)
+        rig.wire.device = _Later(fresh, began)
+        with pytest.raises(DeviceFaultError, match="was reset: it tells how its power-on test went"):
+            rig.run(2.0)
+
     def test_stop(self) -> None:
         """What was sent before the stop can be read, nothing after it; a new start begins at 0."""
         rig = Rig().started()
@@ -426,6 +447,31 @@ class TestRecogniser:
             clock.wait(clock.now() + 0.2)
         noise = np.concatenate([block.rate for block in blocks[5:]]).std(axis=0) / DPH
         assert np.allclose(noise, 0.012 * 60 * 100**0.5, rtol=0.1)
+
+
+class _Later:
+    """A device that was switched on at an instant."""
+
+    session = seen_time_us = 0
+    told_time_us = -1
+    testing = False
+
+    def __init__(self, device: KvhDevice, began_us: int) -> None:
+        self.device = device
+        self.began_us = began_us
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Pass on, in the device's time."""
+        self.device.feed(data, now_us - self.began_us)
+
+    def poll(self, now_us: int, room: int | None = None) -> bytes:
+        """Pass on, in the device's time."""
+        return self.device.poll(now_us - self.began_us, room)
+
+    def next_due_us(self) -> int | None:
+        """Pass on, in the world's time."""
+        due = self.device.next_due_us()
+        return None if due is None else due + self.began_us
 
 
 def _with_number(number: float) -> Callable[[bytes], bytes]:

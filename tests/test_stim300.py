@@ -141,6 +141,28 @@ class TestGolden:
             "error bit 127",
         )
 
+    @given(st.binary(min_size=35, max_size=35))
+    def test_whatever_it_says_of_itself(self, data: bytes) -> None:
+        """Any contents of these datagrams become printable text, or a configuration, or one clear refusal."""
+        texts = [parse_part_number(b"\xb1" + data[:15]), parse_serial_number(b"\xb5" + data[:15])]
+        assert all(
+            text.isprintable() and text.isascii() for text in [*texts, *parse_extended_error(b"\xbe" + data[:16])]
+        )
+        try:
+            found = parse_configuration(b"\xbc" + data[:21])
+        except ProtocolError as error:
+            assert "unknown" in str(error)  # noqa: PT017  # either outcome is right
+        else:
+            assert found.revision.isprintable()
+            assert found.rate_lsb >= 0
+
+    @given(st.binary(max_size=200))
+    def test_any_replies(self, heard: bytes) -> None:
+        """Whatever is heard in utility mode, replies have a good checksum."""
+        for reply in parse_replies(heard):
+            text = ",".join(["#" + reply.command, str(reply.status), *reply.values, ""])
+            assert b"%d\r" % crc8_of(text.encode()) in heard
+
     def test_an_unknown_configuration(self) -> None:
         """A code that no data sheet knows is refused by name."""
         body = golden(0xBC, "45 1f e0" + 18 * "00")[:-4]
@@ -217,6 +239,19 @@ class TestFirmware:
                 counts = (np.diff(counts, axis=0, prepend=0) + 2**23) % 2**24 - 2**23
             turned = 1000 * np.sum(board.rates, axis=0) * 2**-10 / 3600 / 125  # deg
             assert np.abs(counts.sum(axis=0) / 2**21 - turned).max() < 2**-21
+
+    @given(st.lists(st.binary(max_size=30), max_size=10), st.booleans())
+    def test_any_text(self, lines: list[bytes], utility: bool) -> None:  # noqa: FBT001  # drawn
+        """Whatever comes over the line, the unit lives, and streams when it is told to."""
+        device = Stim300Device(TriadBoard())
+        device.poll(300_000)
+        for line in [b"UTILITYMODE"] * utility + lines:
+            device.feed(line + b"\r", 400_000)
+            device.feed(b"$" + line + b",%d\r" % crc8(b"$" + line + b","), 400_000)
+            device.poll(400_000)
+        device.feed(b"\r$xn,150\r", 500_000)
+        device.poll(500_000)
+        assert decoder().feed(device.poll(1_000_000))
 
     def test_a_full_line_loses_whole_datagrams(self) -> None:
         """What has no room is left out as a whole."""

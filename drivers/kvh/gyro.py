@@ -49,7 +49,8 @@ class KvhGyro:
         self, link: ByteLink, clock: Clock, *, axis: str = "", data_rate: int | None = None, may_set: bool = False
     ) -> None:
         self._clock = clock
-        self._stream = FrameStream(link, clock, decoder(), what="KVH gyro")
+        self._stream = FrameStream(link, clock, decoder(), what="KVH gyro", sign=_tells_of_test)
+        self._n_tests = 0
         self._reader = SampleReader(self._stream, clock)
         self._axis = axis
         self._data_rate = data_rate
@@ -125,6 +126,7 @@ class KvhGyro:
         rate, size = self.found.units.data_rate, wire_size(self.found.form)
         self._stream.drain(bytes_per_second=rate * size)
         self._index = SampleIndex(span=SEQUENCE_SPAN, step=1, sample_rate=rate)
+        self._n_tests = self._stream.n_signs
         self._reader.begin(self._blocks, sample_rate=rate, frame_size=size, waiting=[])
 
     def read(self) -> list[RateBlock]:
@@ -136,6 +138,8 @@ class KvhGyro:
             If the link is lost.
         DeviceTimeoutError
             If the stream has fallen silent.
+        DeviceFaultError
+            If the unit was reset.
         ProtocolError
             If it sends another format than it said.
         """
@@ -179,11 +183,13 @@ class KvhGyro:
         """Return messages as blocks, up to what is wrong."""
         form = self.found.form
         runs = [decode_messages(run) for run in frames if FORMATS[run.header] == form]
-        failure = None
+        failure: DeviceError | None = None
         if len(runs) < len(frames):
             failure = ProtocolError(
                 f"{self._stream.link.name} sends another format than {form}, which it said it sends"
             )
+        if self._stream.n_signs > self._n_tests:
+            failure = DeviceFaultError(f"{self._stream.link.name} was reset: it tells how its power-on test went")
         if not runs:
             return [], failure
         messages = np.concatenate(runs) if len(runs) > 1 else runs[0]
@@ -220,6 +226,10 @@ class KvhGyro:
             status=GyroStatus(status) | (GyroStatus.OVERRUN if part.unsure else GyroStatus.OK),
             n_lost=part.n_lost,
         )
+
+
+def _tells_of_test(heard: bytes) -> bool:
+    return find_test(heard) is not None
 
 
 def _specific_force(messages: NDArray[np.void]) -> tuple[float, float, float] | None:

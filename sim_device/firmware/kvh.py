@@ -59,8 +59,9 @@ class KvhDevice:
         lines = (self._line + data).replace(b"\r", b"\n").split(b"\n")
         self._line = lines.pop()[-_MAX_LINE:]
         for line in lines:
-            if line.strip():
-                self._obey(line.strip().upper().decode("ascii", "replace"), now_us)
+            text = "".join([chr(byte) for byte in line.strip() if 32 <= byte < 127])
+            if text:
+                self._obey(text.upper(), now_us)
 
     def poll(self, now_us: int, room: "int | None" = None) -> bytes:
         """Do all that is due and return the bytes to send; messages beyond `room` bytes are lost."""

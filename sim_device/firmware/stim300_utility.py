@@ -40,7 +40,7 @@ class UtilityMode:
         """Return the reply to a command."""
         comma = line.rfind(b",")
         body, given = line[: comma + 1], line[comma + 1 :]
-        if not line.startswith(b"$") or comma < 0:
+        if not line.startswith(b"$") or comma < 0 or any(not 32 <= byte < 127 for byte in line):
             return _line("#,1,")
         if not given.isdigit() or int(given) != crc8(body):
             return _line("#,2,")
