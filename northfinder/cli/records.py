@@ -9,6 +9,7 @@ from typing import Any
 import click
 from rich.box import SIMPLE
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Column, Table
 
 from northfinder.cli.show import print_json
@@ -35,17 +36,17 @@ def command(*, folder: Path, as_json: bool) -> None:
     table = Table(Column("record", no_wrap=True), "state", "plan", "steps", "azimuth, deg", "MB", box=SIMPLE)
     for line in lines:
         table.add_row(*_cells(line))
-    Console().print(table if lines else f"no records in {printable(str(folder))}")
+    Console().print(table if lines else f"no records in {safe(folder)}")
 
 
 def _cells(line: dict[str, Any]) -> tuple[str, ...]:
     style = _STYLE[line["state"]]
     return (
-        printable(Path(line["record"]).name),
+        safe(Path(line["record"]).name),
         f"[{style}]{line['state']}[/{style}]",
-        printable(str(line["plan"] or "")),
-        printable(str(line["steps"] or "").removesuffix(" steps").replace(" of the ", "/")),
-        _with_sd(line["azimuth_deg"], line["azimuth_sd_deg"]),
+        safe(line["plan"] or ""),
+        safe(str(line["steps"] or "").removesuffix(" steps").replace(" of the ", "/")),
+        with_sd(line["azimuth_deg"], line["azimuth_sd_deg"]),
         f"{line['size_bytes'] / 1e6:.1f}",
     )
 
@@ -58,7 +59,13 @@ def utc_text(instant: float) -> str:
         return f"{instant:g} s"
 
 
-def _with_sd(value: object, sd: object) -> str:
+def safe(value: object) -> str:
+    """Return foreign text such that it is shown as it stands, and does nothing."""
+    return escape(printable(str(value)))
+
+
+def with_sd(value: object, sd: object) -> str:
+    """Return a value with its standard deviation, nothing if they are no numbers."""
     if not isinstance(value, float | int) or not isinstance(sd, float | int):
         return ""
     return f"{value:.3f} ± {sd:.3f}"

@@ -10,13 +10,11 @@ from typing import Any
 import click
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
-from northfinder.cli.records import utc_text
+from northfinder.cli.records import safe, utc_text, with_sd
 from northfinder.cli.show import print_json
 from northfinder.record_summary import page
-from northfinder.text import printable
 
 _MAX_EVENTS = 200
 
@@ -41,25 +39,21 @@ def command(*, record: Path, as_json: bool) -> None:
     console.print(_events(found))
 
 
-def _safe(value: object) -> str:
-    return escape(printable(str(value)))
-
-
 def _facts(found: Mapping[str, Any]) -> Table:
     table = Table.grid(padding=(0, 2))
-    table.add_row("record", _safe(found["record"]))
-    table.add_row("state", f"{found['state']}, {_safe(found['steps'])}")
+    table.add_row("record", safe(found["record"]))
+    table.add_row("state", f"{found['state']}, {safe(found['steps'])}")
     if found["started_utc_s"] is not None:
         table.add_row("begun", f"{utc_text(found['started_utc_s'])} UTC")
     for kind, device in _devices(found["meta"].get("identities")):
-        table.add_row(_safe(kind), _safe(device))
-    table.add_row("plan", _safe(found["plan"] or ""))
-    table.add_row("software", _safe(found["meta"].get("northfinder") or ""))
+        table.add_row(safe(kind), safe(device))
+    table.add_row("plan", safe(found["plan"] or ""))
+    table.add_row("software", safe(found["meta"].get("northfinder") or ""))
     table.add_row("streams", f"{len(found['streams'])}, {found['n_blocks']} blocks of samples")
-    if found["azimuth_deg"] is not None:
-        table.add_row("azimuth", f"{found['azimuth_deg']:.3f} ± {found['azimuth_sd_deg']:.3f} deg")
-    if found["latitude_deg"] is not None:
-        table.add_row("latitude", f"{found['latitude_deg']:.3f} ± {found['latitude_sd_deg']:.3f} deg")
+    for name in ("azimuth", "latitude"):
+        value = with_sd(found[f"{name}_deg"], found[f"{name}_sd_deg"])
+        if value:
+            table.add_row(name, f"{value} deg")
     return table
 
 
@@ -80,7 +74,7 @@ def _steps(found: Mapping[str, Any]) -> Table:
         seconds = (span.stop_index - span.first_index) / span.sample_rate if span.sample_rate else math.nan
         angles = (math.degrees(span.measured_azimuth), math.degrees(span.measured_elevation))
         table.add_row(
-            str(span.step + 1), _safe(span.name), f"{angles[0]:.4f}", f"{angles[1]:.4f}", f"{seconds:.1f}",
+            str(span.step + 1), safe(span.name), f"{angles[0]:.4f}", f"{angles[1]:.4f}", f"{seconds:.1f}",
             str(span.stream),
         )  # fmt: skip
     return table
@@ -90,7 +84,7 @@ def _events(found: Mapping[str, Any]) -> Table:
     table = Table("UTC", "event", "", box=SIMPLE)
     told = [event for event in found["events"] if event["kind"] != "state"]
     for event in told[:_MAX_EVENTS]:
-        table.add_row(utc_text(event["utc_s"]), _safe(event["kind"]), escape(printable(event["detail"])))
+        table.add_row(utc_text(event["utc_s"]), safe(event["kind"]), safe(event["detail"]))
     if len(told) > _MAX_EVENTS:
         table.add_row("", f"and {len(told) - _MAX_EVENTS} more", "")
     return table
