@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
+from sim_device.firmware.epson import EpsonDevice
 from sim_device.firmware.gyro import GyroDevice
 from sim_device.firmware.kvh import KvhDevice
 from sim_device.firmware.stage import StageDevice
@@ -66,6 +67,7 @@ class Instrument(Generic[BoardT]):
 
 
 GYROS: dict[str, Instrument[SimGyroBoard]] = {
+    "epson": Instrument(EpsonDevice, profile="m-g370"),
     "kvh": Instrument(KvhDevice, profile="kvh"),
     "native": Instrument(GyroDevice, acknowledges=True),
     "stim300": Instrument(Stim300Device, profile="stim300"),
