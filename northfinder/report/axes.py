@@ -21,6 +21,7 @@ class Axis:
     high: float
     logarithmic: bool = False
     most: int = _UPWARD  #: stretches between ticks
+    least_step: float = 0.0  #: between ticks
 
     def place(self, value: float) -> float:
         """Return where `value` stands, 0 at the low end and 1 at the high one."""
@@ -30,17 +31,21 @@ class Axis:
 
     def ticks(self) -> list[tuple[float, str]]:
         """Return (value, text) of round values within the range."""
-        return _decades(self.low, self.high) if self.logarithmic else _rounds(self.low, self.high, self.most)
+        return (
+            _decades(self.low, self.high)
+            if self.logarithmic
+            else _rounds(self.low, self.high, self.most, self.least_step)
+        )
 
 
-def _rounds(low: float, high: float, most: int) -> list[tuple[float, str]]:
+def _rounds(low: float, high: float, most: int, least_step: float = 0.0) -> list[tuple[float, str]]:
     """Return multiples of 1, 2 or 5 times a power of ten.
 
     >>> [text for _, text in _rounds(0.0, 16.2, 6)]
     ['0', '5', '10', '15']
     """
-    power = 10.0 ** math.floor(math.log10((high - low) / most))
-    step = next(power * m for m in (1, 2, 5, 10) if (high - low) / (power * m) <= most)
+    power = 10.0 ** math.floor(math.log10(max((high - low) / most, least_step)))
+    step = next(power * m for m in (1, 2, 5, 10) if (high - low) / (power * m) <= most and power * m >= least_step)
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [(k * step, f"{k * step:.{decimals}f}".replace("-", "−")) for k in range(first, last + 1)]
@@ -62,7 +67,7 @@ def axes_of(chart: Chart) -> tuple[Axis, Axis]:
     """Return the horizontal and the vertical axis of a chart: as it says, or so that everything is seen."""
     x = chart.x_range or _range([_x(item) for item in chart.items], chart, margin=0.0)
     y = chart.y_range or _range([_y(item) for item in chart.items], chart, margin=0.06)
-    return Axis(*x, chart.logarithmic, _ACROSS), Axis(*y, chart.logarithmic)
+    return Axis(*x, chart.logarithmic, _ACROSS, 1.0 if chart.numbered else 0.0), Axis(*y, chart.logarithmic)
 
 
 def _x(item: Item) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

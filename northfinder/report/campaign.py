@@ -62,7 +62,7 @@ def _chart(
     items.append(Line(x=ends, y=np.full(2, np.nanmean(value)), role="model", label="mean"))
     return Chart(
         name=name, title=title, x_label="measurement", y_label="deg", items=tuple(items),
-        marks=_turn_ons(result), x_range=(0.5, len(value) + 0.5),
+        marks=_turn_ons(result), x_range=(0.5, len(value) + 0.5), numbered=True,
         note="Every second turn-on is shaded." if result["n_turn_ons"] > 1 else "",
     )  # fmt: skip
 

@@ -97,6 +97,7 @@ class Chart:
     note: str = ""  #: what to see in it, in a sentence
     marks: tuple[Mark, ...] = ()
     logarithmic: bool = False  #: both axes
+    numbered: bool = False  #: whether the horizontal axis counts something, in whole numbers
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
     height: float = 1.0  #: relative to the others

@@ -130,7 +130,7 @@ def _missing(name: str, table: dict[str, Any]) -> Figure:
 def standing(report: RecordReport) -> tuple[bool, str]:
     """Return whether the measurement may be relied on, and that in a few words."""
     if report.fix is None:
-        return False, f"No azimuth: {report.failure}"
+        return False, "No azimuth"
     if not report.result.get("complete", True):
         return False, f"Ends before the measurement did, after {report.result['steps']}"
     failed = [check for check in report.result["checks"] if not check["passed"]]

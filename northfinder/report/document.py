@@ -78,7 +78,7 @@ def record_markdown(report: RecordReport) -> str:
     """Return the report's figures and tables as Markdown; whatever comes from a device or a file is escaped."""
     words = standing(report)[1]
     began = "" if report.started is None else f", {moment(report.started)[:16]} UTC"
-    parts = [f"# True north{began}", f"**{escaped(words)}**"]
+    parts = [f"# True north{began}", f"**{escaped(words)}**", escaped(report.failure)]
     figure = azimuth_figure(report)
     if figure is not None:
         figures = [figure, *other_figures(report)]

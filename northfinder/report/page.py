@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 
@@ -43,6 +44,7 @@ def record_page(report: RecordReport) -> str:
         title=f"True north{began}",
         good=good,
         standing=words,
+        failure=printable(report.failure, max_length=1000),
         azimuth=azimuth_figure(report),
         others=other_figures(report),
         rose=_rose(report),
@@ -70,15 +72,15 @@ def record_page(report: RecordReport) -> str:
 
 def render(template: str, **content: Any) -> str:  # noqa: ANN401  # a template takes anything
     """Return a page of the templates; every text in it is escaped, and a name that is missing is a mistake of ours."""
-    environment = Environment(
-        loader=PackageLoader("northfinder.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    style = Markup(environment.loader.get_source(environment, "style.css")[0]) if environment.loader else ""  # noqa: S704  # our own file
-    return environment.get_template(template).render(style=style, **content)
+    return _environment().get_template(template).render(**content)
+
+
+@cache
+def _environment() -> Environment:
+    loader = PackageLoader("northfinder.report", "templates")
+    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.globals["style"] = Markup(loader.get_source(made, "style.css")[0])  # noqa: S704  # our own file
+    return made
 
 
 def _rose(report: RecordReport) -> Markup:

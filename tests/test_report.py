@@ -1,0 +1,456 @@
+"""The report: what is measured is what is shown, in every format; nothing in a record can reach out of the page."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from long_record import write_record
+from look import HOSTILE, HOSTILE_NAME, browser
+from virtual import Unwatched, assume, virtual_bench
+
+from drivers.api import DeviceIdentity
+from northfinder.adaptive import Wishes, make_plan
+from northfinder.cli import cli
+from northfinder.errors import ConfigError
+from northfinder.estimation.allan import averaging_factors, overlapping_allan_deviation
+from northfinder.estimation.means import RateMeans
+from northfinder.geodesy import Place
+from northfinder.measurement import Measurement, measure
+from northfinder.report.axes import Axis
+from northfinder.report.charts import broken, charts, dwell_pairs, pooled_allan
+from northfinder.report.compass import rose
+from northfinder.report.content import azimuth_figure, other_figures, standing
+from northfinder.report.document import record_json, record_markdown
+from northfinder.report.gather import RecordReport, gather_record
+from northfinder.report.page import record_page
+from northfinder.report.series import Envelope, thinned
+from northfinder.solve_file import solve_record
+
+#: Seconds of each dwell of the emulated measurement, and when it began.
+DWELL = 15.0
+IN_2026 = 1_790_000_000.0
+#: Elements that hold no others.
+VOID = {"meta", "link", "br", "path", "circle", "rect"}
+URL_ATTRIBUTES = {"src", "href", "action", "data", "poster", "srcset", "xlink:href", "background", "formaction"}
+
+
+class Page(HTMLParser):
+    """A page as a browser sees it: its elements, its texts, and whether its elements are nested properly."""
+
+    def __init__(self, text: str) -> None:
+        """Read the page."""
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note an element."""
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note an element that is closed at once."""
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        """Note that an element ends, which must be the last one opened."""
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        """Note a text, but for the style."""
+        if "style" not in self.open:
+            self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        """All texts, blanks made one."""
+        return " ".join(" ".join(self.texts).split())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder for the records of this module."""
+    return tmp_path_factory.mktemp("records")
+
+
+@pytest.fixture(scope="module")
+def emulated(folder: Path) -> Path:
+    """Return the record of an emulated measurement of six positions, and back to the first between and at the end."""
+    path = folder / "emulated.sqlite"
+    bench = virtual_bench(azimuth_deg=213.0)
+    measurement = Measurement(
+        open_gyro=bench.open_gyro, open_stage=bench.open_stage, settle=0.5, assumptions=assume(), record=path,
+        plan=make_plan(Wishes(name="six-position", dwell=DWELL), assume(), settle=0.5),
+    )  # fmt: skip
+    measure(measurement, clock=bench.clock, utc=lambda: IN_2026 + bench.clock.now(), watcher=Unwatched())
+    return path
+
+
+@pytest.fixture(scope="module")
+def report(emulated: Path) -> RecordReport:
+    """Return the report of it, at a known position."""
+    return gather_record(emulated, Place.of("50.429,30.523,170", None))
+
+
+@pytest.fixture(scope="module")
+def hostile(folder: Path) -> Path:
+    """Return a record whose devices, plan and notes want to do harm."""
+    path = folder / "hostile.sqlite"
+    gyro = DeviceIdentity(kind="gyro", model=HOSTILE, serial_number=HOSTILE_NAME, firmware_version="\x00\n\x9b")
+    meta = {"northfinder": HOSTILE, "plan": {"name": HOSTILE}, "config": {"gyro": {"address": HOSTILE}}}
+    events = [("note", HOSTILE), (HOSTILE_NAME, HOSTILE)]
+    devices = {"gyro": gyro}
+    write_record(path, seconds=120.0, sample_rate=50.0, n_axes=1, n_dwells=6, identities=devices,
+                 meta=meta | {"identities": devices}, events=events)  # fmt: skip
+    return path
+
+
+@pytest.fixture(scope="module")
+def early(folder: Path) -> Path:
+    """Return a record that determines no azimuth."""
+    path = folder / "early.sqlite"
+    write_record(path, seconds=40.0, sample_rate=50.0, n_axes=1, n_dwells=1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def axes(folder: Path) -> Path:
+    """Return a record of three axes with more dwells than are drawn one by one."""
+    path = folder / "axes.sqlite"
+    write_record(path, seconds=1000.0, sample_rate=20.0, n_axes=3, n_dwells=60)
+    return path
+
+
+# Series
+
+
+@given(st.lists(st.integers(1, 400), min_size=1, max_size=12), st.integers(0, 50), st.integers(0, 2**32))
+def test_an_envelope_is_the_same_however_the_samples_come(sizes: list[int], gap: int, seed: int) -> None:
+    """Least, greatest and mean of each stretch are those of its samples, whatever the batches and the gaps."""
+    rng = np.random.default_rng(seed)
+    envelope, values, places, index = Envelope(2, n_bins=16), [], [], 0
+    for size in sizes:
+        batch = rng.normal(size=(size, 2))
+        envelope.add(index, batch)
+        values.append(batch)
+        places.append(np.arange(index, index + size))
+        index += size + gap
+    found = envelope.series()
+    every, place = np.concatenate(values), np.concatenate(places)
+    width = 2 * (found.x[0] - 0.0) if found.x[0] else 1.0
+    bins = (place // width).astype(int)
+    assert len(found.x) <= 16
+    for row, x in enumerate(found.x):
+        own = every[bins == int(x // width)]
+        assert found.low[row] == pytest.approx(own.min(axis=0))
+        assert found.high[row] == pytest.approx(own.max(axis=0))
+        assert found.mean[row] == pytest.approx(own.mean(axis=0))
+
+
+@given(st.integers(2, 5000), st.integers(2, 60), st.integers(0, 2**32))
+def test_thinning_keeps_the_ends_and_the_peaks(n: int, n_columns: int, seed: int) -> None:
+    """A line drawn from two points a column shows the same extremes."""
+    x, y = np.arange(n, dtype=float), np.random.default_rng(seed).normal(size=n)
+    thin_x, thin_y = thinned(x, y, n_columns=n_columns)
+    assert len(thin_x) <= 2 * n_columns + 2
+    assert (thin_y.min(), thin_y.max(), thin_x[0], thin_x[-1]) == (y.min(), y.max(), 0.0, n - 1.0)
+    assert np.all(np.diff(thin_x) > 0)
+    assert np.array_equal(y[thin_x.astype(int)], thin_y)
+
+
+def test_a_line_is_broken_between_dwells() -> None:
+    """Nothing is drawn where nothing was measured."""
+    x, _ = broken(np.arange(6.0), np.arange(6.0), np.array([0, 0, 0, 1, 1, 1]))
+    assert np.flatnonzero(np.isnan(x)).tolist() == [3]
+
+
+@given(st.floats(-1e5, 1e5), st.floats(1e-3, 1e6))
+def test_ticks_lie_within_their_axis_and_are_told_apart(low: float, span: float) -> None:
+    """At most ten round values, no two with the same text."""
+    ticks = Axis(low, low + span, most=9).ticks()
+    assert len(ticks) <= 10
+    assert all(low - 1e-6 * span <= value <= low + span * (1 + 1e-6) for value, _ in ticks)
+    assert len({text for _, text in ticks}) == len(ticks)
+
+
+def test_the_pooled_allan_deviation_of_one_run_is_the_usual_one() -> None:
+    """And with two runs the squares are weighted by how many differences each gives."""
+    rate = np.random.default_rng(3).normal(size=120)
+    start = np.concatenate([np.arange(80.0), 100.0 + np.arange(40.0)])
+    means = RateMeans(
+        start=start, duration=np.ones(120), rate=rate, azimuth=np.zeros(120), elevation=np.zeros(120),
+        dwell=np.repeat([0, 1], [80, 40]),
+    )  # fmt: skip
+    alone = pooled_allan(means.select(means.dwell == 0), None)
+    both = pooled_allan(means, None)
+    assert alone is not None
+    assert both is not None
+    dph = math.radians(1.0) / 3600.0
+    expected = overlapping_allan_deviation(rate[:80], averaging_factors(80)) / dph
+    assert alone.deviation[:, 0] == pytest.approx(expected)
+    first, second = (overlapping_allan_deviation(part, np.array([1])) / dph for part in (rate[:80], rate[80:]))
+    assert both.deviation[0, 0] ** 2 == pytest.approx(float((79 * first**2 + 39 * second**2)[0] / 118))
+
+
+# What is said
+
+
+def test_the_report_gives_the_fix_of_solve(report: RecordReport, emulated: Path) -> None:
+    """To the last bit, with the bearings of the position given."""
+    solved = solve_record(emulated, place=Place.of("50.429,30.523,170", None))
+    assert {key: report.result[key] for key in solved if key != "plan"} == {
+        key: value for key, value in solved.items() if key != "plan"
+    }
+    assert "grid" in report.result
+
+
+def test_intervals_are_of_95_percent(report: RecordReport) -> None:
+    """The answer is the azimuth with 1.96 standard deviations, to two digits of them."""
+    figure = azimuth_figure(report)
+    assert figure is not None
+    assert float(figure.value.rstrip("°")) == pytest.approx(report.result["azimuth_deg"], abs=0.05)
+    half = 1.959964 * report.result["azimuth_sd_deg"]
+    assert float(figure.interval.rstrip("°")) == pytest.approx(half, rel=0.06)
+    assert [each.name for each in other_figures(report)] == ["Latitude", "Grid azimuth", "Magnetic bearing"]
+    assert all(each.value and each.interval for each in other_figures(report))
+    assert standing(report)[0]
+
+
+def test_dwells_are_shown_as_measured(report: RecordReport) -> None:
+    """Eight dwells; their samples scatter as published, and averaging takes the scatter away."""
+    pairs = dwell_pairs(report)
+    assert [pair.dwell.span.name for pair in pairs] == ["U1", "U2", "U3", "U4", "U1", "U5", "U6", "U1"]
+    dph = math.radians(1.0) / 3600.0
+    assert [float(pair.dwell.raw_sd[0]) / dph for pair in pairs] == pytest.approx([254.0] * 8, rel=0.1)
+    assert [int(pair.dwell.n_samples) for pair in pairs] == [round(DWELL * 235)] * 8
+    assert report.means is not None
+    assert pairs[1].mean[0] == pytest.approx(float(report.means.rate[15:30, 0].mean()) / dph)
+    raw, averaged = (pairs[0].raw.y_range, pairs[0].averaged.y_range)
+    assert raw is not None
+    assert averaged is not None
+    assert raw[1] > 100.0 * averaged[1]
+
+
+def test_the_stage_is_drawn_in_the_time_of_the_samples(report: RecordReport) -> None:
+    """At the middle of each dwell the drawn path stands where the dwell was measured, though its clock is another."""
+    assert report.stage is not None
+    for dwell in report.dwells:
+        middle = (dwell.start + dwell.stop) / 2
+        for drawn, measured in ((report.stage.azimuth, dwell.span.measured_azimuth),
+                                (report.stage.elevation, dwell.span.measured_elevation)):  # fmt: skip
+            assert np.interp(middle, report.stage.time, drawn) == pytest.approx(measured, abs=1e-6)
+
+
+# The page
+
+
+def check_self_contained(page: Page) -> None:
+    """Check that nothing of the page asks for anything or runs anything."""
+    assert not page.open
+    tags = {tag for tag, _ in page.elements}
+    assert not tags & {"script", "iframe", "object", "embed", "img", "form", "base", "image", "use", "foreignobject"}
+    policies = [a["content"] for _, a in page.elements if a.get("http-equiv") == "Content-Security-Policy"]
+    assert len(policies) == 1
+    assert str(policies[0]).startswith("default-src 'none'; style-src 'unsafe-inline'; img-src data:;")
+    for _, attributes in page.elements:
+        assert not [name for name in attributes if name.startswith("on")]
+        assert all(str(attributes[name]).startswith("data:") for name in URL_ATTRIBUTES & set(attributes))
+        assert "url(" not in str(attributes.get("style"))
+
+
+def test_the_page_holds_everything_asked_for(report: RecordReport) -> None:
+    """One well-formed, self-contained page with all sections, light, dark and for paper."""
+    text = record_page(report)
+    page = Page(text)
+    check_self_contained(page)
+    for words in (
+        "Azimuth", "Latitude", "Grid azimuth", "Magnetic bearing", "Checks", "What the uncertainty is made of",
+        "Rate against time", "Each dwell without and with averaging", "Residuals", "Allan deviation of the residuals",
+        "Stage angles", "Tilt", "Temperature", "How it was computed", "Instrument and software", "SIM-G1", "WMM-2025",
+        "UTM zone 36N", "the measured latitude agrees with the position", "passed", "bias instability",
+    ):  # fmt: skip
+        assert words in page.text, words
+    assert "prefers-color-scheme: dark" in text
+    assert "@page { size: A4" in text
+    assert "url(" not in text
+    assert "@import" not in text
+    labels = [a.get("aria-label") for tag, a in page.elements if tag == "svg"]
+    assert all(labels)
+    assert len(labels) == 2 + 2 * 8 + len(charts(report))
+
+
+def test_the_numbers_drawn_are_numbers(report: RecordReport) -> None:
+    """No path holds a nan or an infinity, which a browser would drop without a word."""
+    drawn = [str(a["d"]) for tag, a in Page(record_page(report)).elements if tag == "path"]
+    assert len(drawn) > 20
+    assert all(re.fullmatch(r"[MLHVAZ0-9 .\-lv]*", each) for each in drawn)
+
+
+def test_nothing_in_a_record_does_anything(hostile: Path) -> None:
+    """Names and notes with markup, scripts, escape codes and turned text are shown as text, or as question marks."""
+    report = gather_record(hostile)
+    text = record_page(report)
+    check_self_contained(Page(text))
+    assert "<script>document" not in text
+    assert "&lt;script&gt;document" in text
+    for shown in (text, record_markdown(report)):
+        assert not [character for character in shown if not character.isprintable() and character != "\n"]
+    assert "\\<script\\>document" in record_markdown(report)
+    assert not re.search(r"(?<!\\)<", record_markdown(report))
+    assert "49" not in Page(text).text.split("{{")[1][:12]
+
+
+@settings(max_examples=50)
+@given(st.text(max_size=60))
+def test_any_name_is_shown_or_replaced(name: str) -> None:
+    """Whatever a device calls itself, the page has the same elements and only printable characters."""
+    from northfinder.report.page import render  # noqa: PLC0415  # beside its only use
+    from northfinder.text import printable  # noqa: PLC0415
+
+    given_names = {
+        "title": "t", "value": "", "scatter": "", "facts": [("gyro", printable(name))], "plots": [],
+        "scatter_head": [], "scatter_rows": [], "judged_head": [], "judged_rows": [], "record_head": [],
+        "record_rows": [[printable(name)]], "version": "",
+    }  # fmt: skip
+    page = Page(render("campaign.html", **given_names))
+    plain = Page(render("campaign.html", **(given_names | {"facts": [("gyro", "x")], "record_rows": [["x"]]})))
+    assert page.elements == plain.elements
+    assert all(character.isprintable() or character == "\n" for text in page.texts for character in text)
+
+
+def test_a_record_without_an_azimuth_has_a_report(early: Path) -> None:
+    """It says why there is none, and shows what was measured."""
+    page = Page(record_page(gather_record(early)))
+    check_self_contained(page)
+    assert "No azimuth" in page.text
+    assert "do not determine" in page.text
+    assert "Rate against time" in page.text
+    assert "Allan deviation" not in page.text
+
+
+def test_three_axes_and_many_dwells(axes: Path) -> None:
+    """Each axis has its colour; beyond 48 dwells the page says how many it leaves out."""
+    report = gather_record(axes)
+    page = Page(record_page(report))
+    check_self_contained(page)
+    assert "axis 3" in page.text
+    assert "The 12 later dwells are not drawn" in page.text
+    assert report.n_missing == 0
+
+
+def test_the_rose_points_where_the_azimuth_does() -> None:
+    """The needle's tip lies in the direction of the azimuth in all quadrants; the wedge is as wide as the interval."""
+    for azimuth in (0.0, 33.0, 123.0, 213.0, 303.0):
+        svg = rose(azimuth, 2.0, grid_deg=None, magnetic_deg=None)
+        needle = re.search(r'class="needle" d="M(\S+) (\S+?)L', svg)
+        assert needle is not None
+        x, y = float(needle[1]), float(needle[2])
+        assert math.degrees(math.atan2(x, -y)) % 360 == pytest.approx(azimuth, abs=0.02)
+        wedge = re.search(r'class="wedge" d="M0 0L(\S+) (\S+?)A\S+ \S+ 0 0 1 (\S+) (\S+?)Z', svg)
+        assert wedge is not None
+        low, high = (math.degrees(math.atan2(float(wedge[k]), -float(wedge[k + 1]))) for k in (1, 3))
+        assert (high - low) % 360 == pytest.approx(4.0, abs=0.02)
+
+
+# The command and the other formats
+
+
+def invoke(*arguments: object) -> Result:
+    """Run the command line in this process."""
+    return CliRunner().invoke(cli, [str(each) for each in arguments], catch_exceptions=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "begins"),
+    [
+        ("html", b"<!doctype html>"),
+        ("svg", b"<?xml"),
+        ("png", b"\x89PNG"),
+        ("pdf", b"%PDF"),
+        ("json", b"{"),
+        ("md", b"# "),
+    ],
+)
+def test_each_format_is_written_beside_the_record(emulated: Path, kind: str, begins: bytes) -> None:
+    """With the record's name, and said on standard output."""
+    done = invoke("report", emulated, "--format", kind)
+    assert done.exit_code == 0, done.output
+    path = emulated.with_suffix(f".{kind}")
+    assert done.output.strip() == str(path)
+    assert path.read_bytes().startswith(begins)
+    assert sorted(each.name for each in emulated.parent.glob(".*")) == []
+
+
+def test_the_json_is_the_report_as_data(emulated: Path, report: RecordReport) -> None:
+    """On standard output, one object: the fix of solve, the dwells, the residuals' Allan deviation."""
+    done = invoke("report", emulated, "--format", "json", "-o", "-")
+    data = json.loads(done.output)
+    assert data["result"]["azimuth_deg"] == report.result["azimuth_deg"]
+    assert len(data["dwells"]) == 8
+    assert data["residual_allan"]["tau_s"][0] == 1.0
+    assert data["identities"]["gyro"]["serial_number"] == "SIM-G1"
+    assert set(data) == set(record_json(report))
+
+
+def test_the_markdown_has_tables_of_equal_rows(report: RecordReport) -> None:
+    """Each table's rows have as many cells as its head."""
+    for table in re.findall(r"(?:^\|.*\|\n)+", record_markdown(report), re.MULTILINE):
+        cells = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines()}
+        assert len(cells) == 1
+
+
+def test_a_picture_of_one_part(emulated: Path, early: Path, tmp_path: Path) -> None:
+    """The same data give the same file; what a record does not have is named."""
+    files = [tmp_path / f"{n}.svg" for n in (1, 2)]
+    for file in files:
+        assert invoke("report", emulated, "--part", "rate", "-o", file).exit_code == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
+    done = invoke("report", early, "--part", "allan", "-o", tmp_path / "a.svg")
+    assert "nothing to draw as --part allan" in str(done.exception)
+
+
+def test_no_record_is_ever_written_over(emulated: Path) -> None:
+    """Neither the one that is read nor any other database."""
+    before = emulated.read_bytes()
+    done = invoke("report", emulated, "-o", emulated)
+    assert isinstance(done.exception, ConfigError)
+    assert emulated.read_bytes() == before
+
+
+def test_the_report_of_a_campaign(folder: Path, emulated: Path, hostile: Path) -> None:
+    """Many records give one page, and its tables and picture in the other formats."""
+    page = folder / "campaign.html"
+    done = invoke("report", emulated, hostile, "-o", page)
+    assert done.exit_code == 0, done.exception
+    parsed = Page(page.read_text(encoding="utf-8"))
+    check_self_contained(parsed)
+    assert "Campaign of 2 measurements" in parsed.text
+    for kind, begins in (("md", "# Campaign"), ("json", '{"n_records":2'), ("svg", "<?xml")):
+        path = folder / f"campaign.{kind}"
+        assert invoke("report", emulated, hostile, "-o", path).exit_code == 0
+        assert path.read_text(encoding="utf-8").startswith(begins)
+
+
+@pytest.mark.campaign
+def test_the_pages_in_a_browser(tmp_path: Path) -> None:
+    """Rendered wide and narrow, light and dark, and on paper: nothing overlaps, is cut, complains or asks for more."""
+    if browser() is None:
+        pytest.skip("no Chromium on this machine")
+    tool = Path(__file__).resolve().parents[1] / "tools" / "look.py"
+    done = subprocess.run([sys.executable, str(tool), str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
