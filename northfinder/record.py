@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -85,7 +85,7 @@ def one_line(path: Path, doing: str) -> Iterator[None]:
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
-    """Return a connection that reads the record at `path` and never changes it.
+    """Return a connection that reads the record at `path`, and changes no more of it than a cut left to be undone.
 
     Raises RecordError if it is no record of a version this program knows.
     """
@@ -95,8 +95,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_ROW_BYTES)
         try:
-            application_id = db.execute("PRAGMA application_id").fetchone()[0]
-            version = db.execute("PRAGMA user_version").fetchone()[0]
+            application_id, version = _kind(db, path)
         except sqlite3.OperationalError:  # it could be one, but not here: no rights, no room beside it
             db.close()
             raise
@@ -108,6 +107,19 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         found = f"version {version}" if application_id == APPLICATION_ID else "another kind of SQLite file"
         raise RecordError(f"{path} is no record of version {SCHEMA_VERSION}: found {found}")
     return db
+
+
+def _kind(db: sqlite3.Connection, path: Path) -> tuple[int, int]:
+    """Return application and version of a database; first undo what was cut off while it was being closed."""
+    try:
+        application_id = db.execute("PRAGMA application_id").fetchone()[0]
+    except sqlite3.OperationalError:
+        if not path.with_name(path.name + "-journal").exists():
+            raise
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as writer:
+            writer.execute("PRAGMA schema_version")
+        application_id = db.execute("PRAGMA application_id").fetchone()[0]
+    return application_id, db.execute("PRAGMA user_version").fetchone()[0]
 
 
 class Record:

@@ -52,8 +52,8 @@ def _open(path: Path, doing: str, *, create_tables: bool) -> tuple[sqlite3.Conne
         db = sqlite3.connect(path, timeout=CLOSE_TIMEOUT, isolation_level=None, check_same_thread=False)
         if create_tables:
             db.execute(f"PRAGMA page_size = {PAGE_SIZE}")
+        db.execute("PRAGMA synchronous = EXTRA")  # FULL, and no journal comes back after the power has failed
         db.execute("PRAGMA journal_mode = WAL")
-        db.execute("PRAGMA synchronous = FULL")
         if create_tables:
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")

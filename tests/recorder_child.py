@@ -1,0 +1,38 @@
+"""A process that records, for tests that kill it or take its disk away: ``recorder_child.py FILE N_BLOCKS [BYTES]``.
+
+It says ``ack K`` once K blocks are durable; BYTES limits the size of its files.
+"""
+
+import os
+import resource
+import sys
+from pathlib import Path
+
+from recording import block, fill
+
+from northfinder.errors import RecordError
+from northfinder.recorder import Recorder
+
+
+def main(path: Path, n_blocks: int) -> int:
+    """Record blocks one after the other, each made durable; return the exit code."""
+    try:
+        with Recorder(path, lambda: 1.0) as recorder:
+            # A log of a few pages is copied to the file many times.
+            recorder._writer._db.execute("PRAGMA wal_autocheckpoint = 12")
+            fill(recorder, 0)
+            recorder.flush()
+            for k in range(n_blocks):
+                recorder.add_block(block(39 * k))
+                recorder.flush()
+                os.write(1, f"ack {k + 1}\n".encode())
+    except RecordError as error:
+        os.write(2, f"{error}\n".encode())
+        return 5
+    return 0
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 3:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
+    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2])))
