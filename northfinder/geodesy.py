@@ -1,4 +1,4 @@
-"""From the true azimuth to those of a map and of a compass, where the position is known (docs/method.md, section 11).
+"""From the true azimuth to those of a map and of a compass, where the position is known (docs/method.md, section 12).
 
 grid azimuth     = true azimuth - meridian convergence     grid north east of true north is positive
 magnetic bearing = true azimuth - declination              magnetic north east of true north is positive
