@@ -1,10 +1,15 @@
 """Compare errors with stated standard deviations over the globe, each run a whole ``find`` on the emulated bench.
 
     python tools/consistency.py [--json] [--repeat N | --runs N] [-- FIND-OPTION...]
+    python tools/consistency.py --buses [-- FIND-OPTION...]
 
 Every azimuth of AZIMUTHS_DEG at every latitude of LATITUDES_DEG, or with --runs so many azimuths around the horizon at
 these latitudes in turn, each with a seed of its own, through pseudo-terminals and the whole protocol. The rms of error
 over stated standard deviation is 1 if the statement is honest.
+
+With --buses each azimuth is measured over serial lines, over socketcand at full speed and over slcan at ten times real
+time, with the same seed: a table of errors and standard deviations, and exit code 1 unless those of a bus are the
+serial line's to SD_TOLERANCE, the errors to ERROR_TOLERANCE standard deviations.
 """
 
 from __future__ import annotations
@@ -21,6 +26,9 @@ from dataclasses import asdict, dataclass
 
 AZIMUTHS_DEG = (0.0, 33.0, 90.0, 147.0, 180.0, 225.0, 270.0, 359.0)
 LATITUDES_DEG = (-65.0, -33.0, 0.5, 20.0, 50.429, 75.0)
+BUSES = {"serial": [], "socketcand": ["--bus", "socketcand"], "slcan": ["--bus", "slcan", "--speed", "10"]}
+SD_TOLERANCE = 0.05
+ERROR_TOLERANCE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +89,22 @@ def all_runs(at: list[tuple[float, float]], options: list[str]) -> Iterator[Run]
         yield run
 
 
+def compare_buses(options: list[str]) -> bool:
+    """Print the table of all azimuths over serial lines and buses; return whether they agree."""
+    print("| azimuth | " + " | ".join(f"{bus}: error, sd, deg" for bus in BUSES) + " | greatest difference, sd |")
+    print("|---|" + "---|" * (len(BUSES) + 1))
+    agree = True
+    for seed, azimuth in enumerate(AZIMUTHS_DEG, start=1):
+        serial, *others = runs = [find(azimuth, 50.429, seed, [*options, *extra]) for extra in BUSES.values()]
+        sd = serial.azimuth_sd_deg
+        difference = max(abs(run.azimuth_error_deg - serial.azimuth_error_deg) for run in others) / sd
+        same_sd = all(abs(run.azimuth_sd_deg / sd - 1) <= SD_TOLERANCE for run in others)
+        agree = agree and same_sd and difference <= ERROR_TOLERANCE
+        cells = [f"{run.azimuth_error_deg:+.4f}, {run.azimuth_sd_deg:.4f}" for run in runs]
+        print(f"| {azimuth} | {' | '.join(cells)} | {difference:.3f} |", flush=True)
+    return agree
+
+
 def rms(values: list[float]) -> float | None:
     """Return the root mean square, None of nothing."""
     return math.sqrt(math.fsum(value**2 for value in values) / len(values)) if values else None
@@ -91,9 +115,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--runs", type=int, metavar="N", help="so many azimuths instead of the whole grid")
+    parser.add_argument("--buses", action="store_true", help="compare CAN buses with serial lines")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     parser.add_argument("options", nargs="*", help="handed to find, after --")
     arguments = parser.parse_args()
+    if arguments.buses:
+        sys.exit(0 if compare_buses(arguments.options) else 1)
     runs = list(all_runs(places(arguments.repeat, arguments.runs), arguments.options))
     latitudes = [(run.latitude_error_deg, run.latitude_sd_deg) for run in runs]
     figures = {

@@ -24,7 +24,7 @@ from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, Pr
 EDS_FOLDER = Path(__file__).parent.parent / "eds"
 HEARTBEAT_MS = 100  #: of a node, as the drivers ask for it
 MAX_SILENCE = 0.25  # s without a heartbeat; found within 300 ms by a host that looks each 50 ms
-LONGEST_LOOK = 0.1  # s; a host that was away for longer has not listened for longer
+LONGEST_LOOK = 0.06  # s; a host that was away for longer has not listened for longer: at least five looks find nothing
 SERVICE_PERIOD = 0.05  # s, how often a wait looks after the other duties
 MAX_WAITING = 4096  # frames of one PDO that wait for the driver
 OPERATIONAL = 5
@@ -69,6 +69,7 @@ class Node:
     def __init__(self, link: FrameLink, clock: Clock, dictionary: canopen.ObjectDictionary, *, title: str) -> None:
         self.id = dictionary.node_id or 0
         self.remote = LinkNode(self.id, dictionary, clock, self.wait)
+        self.max_silence = MAX_SILENCE  #: s without a heartbeat, after which the node counts as cut off
         self.duty: Callable[[], None] = lambda: None  #: done before each look at what has arrived, for heartbeats
         self.emergencies: list[EmcyError] = []  #: that the driver has not yet taken
         self.state = -1  #: NMT state in the last heartbeat, -1 if none has come
@@ -156,13 +157,13 @@ class Node:
         DeviceFaultError
             If it was reset, or has left OPERATIONAL.
         DeviceTimeoutError
-            If no heartbeat has come for 250 ms.
+            If no heartbeat has come for `max_silence`.
         """
         if not self._watched:
             return
         if self.was_reset:
             raise DeviceFaultError(f"{self.name} was reset: it has sent its boot-up message; connect again")
-        if self._silence > MAX_SILENCE:
+        if self._silence > self.max_silence:
             raise DeviceTimeoutError(
                 f"{self.name} has sent no heartbeat for {self._silence * 1000:.0f} ms: was it cut off?"
             )

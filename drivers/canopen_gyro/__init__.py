@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.api import Clock, Gyro
 from drivers.canopen.address import parse_node_address
+from drivers.canopen.node import MAX_SILENCE
 from drivers.canopen_gyro.gyro import IDENTIFIERS, CanopenGyro
 from drivers.transport.can_bus import open_bus
 from drivers.transport.serial_port import DEFAULT_BAUDRATE
@@ -18,6 +19,7 @@ def open_gyro(
     baudrate: int = DEFAULT_BAUDRATE,
     sample_rate: float | None = None,
     block_samples: int | None = None,
+    max_silence: float = MAX_SILENCE,
 ) -> Gyro:
     """Open the bus of a gyro; `connect` then speaks to it. `baudrate` is that of an slcan adapter's serial port.
 
@@ -31,4 +33,4 @@ def open_gyro(
     where = parse_node_address(address, 1)
     node = where.nodes[0]
     link = open_bus(where.bus, clock, accept=[base + node for base in IDENTIFIERS], baudrate=baudrate)
-    return CanopenGyro(link, clock, node, sample_rate=sample_rate, block_samples=block_samples)
+    return CanopenGyro(link, clock, node, sample_rate=sample_rate, block_samples=block_samples, max_silence=max_silence)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from drivers.api import Clock, DeviceIdentity, FrameLink, RateBlock, SelfTest
 from drivers.canopen.identity import identify, run_self_test
-from drivers.canopen.node import HEARTBEAT_MS, OPERATIONAL, Node, load_dictionary
+from drivers.canopen.node import HEARTBEAT_MS, MAX_SILENCE, OPERATIONAL, Node, load_dictionary
 from drivers.canopen.pdo import PdoCodec
 from drivers.canopen_gyro.samples import SampleAssembler, SampleOrderError
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
 from drivers.protocol.native import RATE_LSB
 
 EDS = "gyro.eds"
-MAX_SILENCE = 1.0  # s without samples, or five blocks if that is longer
+LONGEST_PAUSE = 1.0  # s without samples, or five blocks if that is longer
 BLOCK_TIME = 0.2  # s, of a gyro that sends its samples in shorter bursts
 IDENTIFIERS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x500, 0x580, 0x700)  #: to which the node's number is added
 
@@ -40,6 +40,8 @@ class CanopenGyro:
         Samples a second to ask for, None to leave it.
     block_samples
         Samples a burst to ask for, None to leave it.
+    max_silence
+        Time without a heartbeat, s, after which the node counts as cut off.
     """
 
     def __init__(
@@ -50,9 +52,11 @@ class CanopenGyro:
         *,
         sample_rate: float | None = None,
         block_samples: int | None = None,
+        max_silence: float = MAX_SILENCE,
     ) -> None:
         self._clock = clock
         self._node = node = Node(link, clock, load_dictionary(EDS, node_id), title="gyro")
+        node.max_silence = max_silence
         self._axis_codecs = [PdoCodec(node.remote.tpdo[number]) for number in _AXIS_PDOS]
         self._mark_codec, self._slow_codec = PdoCodec(node.remote.tpdo[2]), PdoCodec(node.remote.tpdo[3])
         self._seen_codec = PdoCodec(node.remote.rpdo[1])
@@ -225,7 +229,7 @@ class CanopenGyro:
         node.emergencies.clear()
         node.check_alive()
         silence = self._clock.now() - self._heard_at
-        if self._streaming and silence > max(MAX_SILENCE, 5 * self._block_samples / self._sample_rate):
+        if self._streaming and silence > max(LONGEST_PAUSE, 5 * self._block_samples / self._sample_rate):
             raise DeviceTimeoutError(f"{node.name} is alive but has sent no samples for {silence:.1f} s")
 
     def _acknowledge(self) -> None:

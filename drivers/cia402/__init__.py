@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.api import Clock, Stage, StageLimits
 from drivers.canopen.address import parse_node_address
+from drivers.canopen.node import MAX_SILENCE
 from drivers.cia402.options import DriveOptions
 from drivers.cia402.stage import IDENTIFIERS, Cia402Stage
 from drivers.transport.can_bus import open_bus
@@ -19,6 +20,7 @@ def open_stage(
     baudrate: int = DEFAULT_BAUDRATE,
     limits: StageLimits | None = None,
     drive: DriveOptions | None = None,
+    max_silence: float = MAX_SILENCE,
 ) -> Stage:
     """Open the bus of a stage; `connect` then speaks to it. `baudrate` is that of an slcan adapter's serial port.
 
@@ -39,4 +41,4 @@ def open_stage(
         for link in links:
             link.close()
         raise
-    return Cia402Stage(links, clock, where.nodes, limits=limits, options=drive)
+    return Cia402Stage(links, clock, where.nodes, limits=limits, options=drive, max_silence=max_silence)

@@ -8,7 +8,7 @@ from math import degrees
 
 from drivers.api import Clock, DeviceIdentity, FrameLink, SelfTest, StageLimits, StageMode, StageState
 from drivers.canopen.identity import run_self_test
-from drivers.canopen.node import OPERATIONAL, SERVICE_PERIOD
+from drivers.canopen.node import MAX_SILENCE, OPERATIONAL, SERVICE_PERIOD
 from drivers.cia402 import setup
 from drivers.cia402.axis import AXIS_NAMES, Activity, Axis
 from drivers.cia402.options import DriveOptions
@@ -51,6 +51,8 @@ class Cia402Stage:
         Narrows the limits that the drives have; never widens them.
     options
         How the drives are used.
+    max_silence
+        Time without a heartbeat, s, after which a node counts as cut off.
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class Cia402Stage:
         *,
         limits: StageLimits | None = None,
         options: DriveOptions | None = None,
+        max_silence: float = MAX_SILENCE,
     ) -> None:
         options = options or DriveOptions()
         self._clock = clock
@@ -70,6 +73,7 @@ class Cia402Stage:
         ]
         for axis in self._axes:
             axis.node.duty = self._beat
+            axis.node.max_silence = max_silence
         self._own_limits = limits
         self._limits: StageLimits | None = None
         self._state: StageState | None = None

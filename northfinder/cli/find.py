@@ -38,6 +38,7 @@ from northfinder.triad_plans import TRIAD_PLANS, fit_for
 
 #: When the command was given, as near as can be told.
 STARTED = time.monotonic()
+EMULATED_SILENCE = 5.0  #: s without a heartbeat, for which an emulated node is waited
 
 
 @click.command("find")
@@ -307,11 +308,20 @@ def _today() -> date:
 def _emulated(config: Config, emulator: EmulatorProcess) -> Config:
     """Return the configuration with the emulator's addresses."""
     addresses = emulator.announcement()
-    return msgspec.structs.replace(
+    config = msgspec.structs.replace(
         config,
         gyro=msgspec.structs.replace(config.gyro, address=addresses["gyro"]),
         stage=None if config.stage is None else msgspec.structs.replace(config.stage, address=addresses["stage"]),
     )
+    return _patient(config) if addresses["gyro"].startswith("canopen-gyro:") else config
+
+
+def _patient(config: Config) -> Config:
+    """Return the configuration such that an emulated node, which may wait for a busy machine, is not taken for dead."""
+    options = config.gyro.options | {"max_silence": EMULATED_SILENCE}
+    gyro = msgspec.structs.replace(config.gyro, options=options)
+    stage = None if config.stage is None else msgspec.structs.replace(config.stage, options=options)
+    return msgspec.structs.replace(config, gyro=gyro, stage=stage)
 
 
 def _record_path(folder: Path) -> Path:

@@ -17,7 +17,7 @@ from sim_device.plant.stage import Stage
 
 RATE_LSB = DPH / 1024  #: rad/s in one count of rate
 ANGLE_LSB = ARCSEC / 10  #: rad in one count of angle
-NOISE_STEP_S = 60  #: see `SimGyroBoard.start_sampling`
+NOISE_STEP_S = 600  #: see `SimGyroBoard.start_sampling`
 
 NOT_READY, SATURATED, SENSOR_FAULT = 1, 2, 4  #: status bits of SAMPLES
 
@@ -87,8 +87,8 @@ class SimGyroBoard(GyroBoard):
     def start_sampling(self, now_us: int) -> None:
         """Take the first sample at `now_us`.
 
-        The noise has gone on since the board's start, but in steps of a minute, so that a stream which starts a moment
-        sooner or later meets the same noise.
+        The noise has gone on since the board's start, but in steps of ten minutes, so that a stream which starts a
+        moment sooner or later, as after another homing or over another line, meets the same noise.
         """
         per_step = NOISE_STEP_S * self.sample_rate_millihz // 1000
         begin = now_us // (NOISE_STEP_S * 1_000_000) * per_step
