@@ -2,13 +2,12 @@
 
 A file is UTF-8 text: ``#`` lines are comments, of which ``# key: value`` is kept as metadata; the first other line
 holds the column names; every later line is a row with a number in each wanted column. Reading goes by chunks. A large
-chunk of plain decimals goes through a bulk parser; whatever that refuses is read again line by line, which either
-accepts it or names the line and the column.
+chunk of regular rows goes through Arrow, on all processors; whatever that refuses is read again in smaller chunks, and
+in the end line by line, which either accepts it or names the line and the column.
 """
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -23,11 +22,10 @@ from northfinder.errors import RecordError
 
 MAX_LINE = 65_536  #: bytes; a longer line is no row of a table
 MAX_ROWS = 50_000_000
-_CHUNK = 1 << 22
+_LARGE = 1 << 26  #: bytes read at a time
+_CHUNK = 1 << 22  #: of which a processor takes so many
 _BULK = 1 << 18  #: bytes from which the bulk parser is worth its start
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_COMMA_TO_NEWLINE = bytes.maketrans(b",", b"\n")
-_PLAIN_LABEL = re.compile(rb"[A-Za-z_]*")  # shares no byte with a plain decimal
 
 Array = NDArray[np.float64]
 
@@ -90,18 +88,51 @@ def read_rows(
         For the first row that does not hold a finite number in each wanted column.
     """
     n_lines, n_rows = header.n_lines, 0
-    while chunk := file.read(_CHUNK):
-        chunk += file.readline(MAX_LINE + 1)
-        chunk = chunk if chunk.endswith(b"\n") else chunk + b"\n"
-        n_here = chunk.count(b"\n")
-        bulk = _bulk(chunk, n_here, len(header.names), label) if len(chunk) >= _BULK else None
-        runs = _lines(chunk, n_lines, header.names, wanted, label) if bulk is None else [(bulk[0], bulk[1][wanted])]
-        for name, columns in runs:
+    while chunk := _whole_lines(file):
+        for name, columns in _rows(chunk, n_lines, header.names, wanted, label):
             n_rows += columns.shape[1]
             yield name, columns
         if n_rows > MAX_ROWS:
             raise RecordError(f"the file has more than {MAX_ROWS} rows")
-        n_lines += n_here
+        n_lines += _count_lines(chunk)
+
+
+def _whole_lines(file: BinaryIO) -> bytes:
+    """Return about _LARGE bytes that end with a line, none at the end of the file."""
+    start = file.tell()
+    file.seek(start + _LARGE)
+    file.readline(MAX_LINE + 1)
+    end = file.tell()
+    file.seek(start)
+    chunk = file.read(end - start)  # at once: these are too many bytes to copy once more
+    return chunk + b"\n" if chunk and not chunk.endswith(b"\n") else chunk
+
+
+def _rows(
+    chunk: bytes, n_before: int, names: Sequence[str], wanted: Sequence[int], label: int | None
+) -> Iterator[tuple[str, Array]]:
+    """Yield the runs of a chunk of whole lines: in bulk, or else of its parts, the irregular ones line by line."""
+    whole = _bulk(chunk, names, wanted, label) if len(chunk) >= _BULK else None
+    if whole is not None:
+        yield from whole
+        return
+    for part in _parts(chunk):
+        runs = _bulk(part, names, wanted, label) if len(part) >= _BULK else None
+        yield from _lines(part, n_before, names, wanted, label) if runs is None else runs
+        n_before += _count_lines(part)
+
+
+def _count_lines(chunk: bytes) -> int:
+    return int(np.count_nonzero(np.frombuffer(chunk, dtype=np.uint8) == ord("\n")))
+
+
+def _parts(chunk: bytes) -> Iterator[bytes]:
+    """Yield parts of about _CHUNK bytes that end with a line."""
+    start = 0
+    while start < len(chunk):
+        end = chunk.find(b"\n", start + _CHUNK - 1) + 1 or len(chunk)
+        yield chunk[start:end]
+        start = end
 
 
 def shown(text: str) -> str:
@@ -155,33 +186,44 @@ def _number(field: str, line: int, column: str) -> float:
     return float(field)
 
 
-def _bulk(chunk: bytes, n_rows: int, n_columns: int, label: int | None) -> tuple[str, Array] | None:
-    """Return label and columns, shape (n_columns, n_rows), of a chunk of plain decimals of one label; None for another.
+def _bulk(
+    chunk: bytes, names: Sequence[str], wanted: Sequence[int], label: int | None
+) -> list[tuple[str, Array]] | None:
+    """Return the runs of a chunk of regular rows, as `_lines` would; None if a row is not regular.
 
-    The parser behind `scipy.io.mmread` is the fastest at hand, but it ends a number quietly at what it does not know
-    and skips empty lines. So what is left of the chunk without digits and signs must be that of regular rows, no field
-    with two points; each sign must begin its field; and an empty field is missed in the count of numbers.
+    Arrow reads on all processors, and takes some things for rows or numbers that are none here: those are looked for,
+    and left to `_lines`.
     """
-    from scipy.io import mmread  # noqa: PLC0415  # dear to import, and only large files need it
+    import pyarrow as pa  # noqa: PLC0415  # dear to import, and only large files need it
+    from pyarrow import csv  # noqa: PLC0415
 
-    if b"\r" in chunk:
-        chunk = chunk.replace(b"\r\n", b"\n")
-    first = chunk[: chunk.index(b"\n")].split(b",")
-    name = b"" if label is None or len(first) <= label else first[label]
-    row = b",".join(name if i == label else b"" for i in range(n_columns)) + b"\n"
-    skeleton = chunk.translate(None, b"0123456789-")
-    if not _PLAIN_LABEL.fullmatch(name) or b".." in skeleton or skeleton.translate(None, b".") != row * n_rows:
+    if chunk.startswith(b"#") or b"\n#" in chunk or (b"\r" in chunk and chunk.count(b"\r") != chunk.count(b"\r\n")):
         return None
-    data = np.frombuffer(b"\n" + chunk, dtype=np.uint8)
-    if np.any(data[np.flatnonzero(data == ord("-")) - 1] > ord(",")):  # what may stand there is "," or a line's end
-        return None
-    head = f"%%MatrixMarket matrix array real general\n{n_columns - bool(name)} {n_rows}\n".encode()
+    columns = [str(i) for i in range(len(names))]
+    types = {columns[i]: pa.float64() for i in wanted}
+    if label is not None:
+        types[columns[label]] = pa.dictionary(pa.int32(), pa.string())
     try:
-        columns = mmread(io.BytesIO(head + chunk.translate(_COMMA_TO_NEWLINE, name)))
-    except ValueError:
+        table = csv.read_csv(
+            pa.BufferReader(chunk),
+            csv.ReadOptions(column_names=columns, block_size=_CHUNK),
+            csv.ParseOptions(quote_char=False),
+            csv.ConvertOptions(include_columns=list(types), column_types=types, null_values=[]),
+        )
+    except pa.ArrowInvalid:
         return None
-    if not np.isfinite(columns).all():
-        return None
-    if name and label is not None:
-        columns = np.insert(columns, label, 0.0, axis=0)
-    return name.decode(), columns
+    runs: list[tuple[str, Array]] = []
+    for batch in table.to_batches():
+        numbers = np.array([batch.column(columns[i]).to_numpy() for i in wanted])
+        if not math.isfinite(numbers.sum()) and not np.isfinite(numbers).all():
+            return None
+        if label is None:
+            runs.append(("", numbers))
+            continue
+        codes = batch.column(columns[label])
+        texts = [text.strip().strip('"') for text in codes.dictionary.to_pylist()]
+        edges = np.flatnonzero(np.diff(codes.indices.to_numpy())) + 1
+        first = np.concatenate([[0], edges])
+        of_runs = codes.indices.to_numpy()[first].tolist()
+        runs += [(texts[code], part) for code, part in zip(of_runs, np.split(numbers, edges, axis=1), strict=True)]
+    return runs

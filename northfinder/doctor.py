@@ -178,7 +178,7 @@ def _alive(stream: Stream) -> Finding:
     frozen = [AXES[axis] for axis in np.flatnonzero(np.ptp(counts, axis=0) == 0)] if len(counts) > 100 else []
     if frozen:
         return verdict("signal", f"axis {', '.join(frozen)} gives one value only: it is dead or not read", passed=False)
-    return verdict("signal", f"all of {stream.n_axes} axes give a living signal", passed=True)
+    return verdict("signal", "every axis gives a living signal", passed=True)
 
 
 def check_rate(stream: Stream, *, bias_sd: float | None = None) -> Finding:

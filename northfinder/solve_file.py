@@ -110,11 +110,11 @@ def _solve_table(
     # What only tables need is dear to import, and records are solved much more often.
     from northfinder.estimation.double_gyrocompass import solve_triad  # noqa: PLC0415
     from northfinder.estimation.dwell_table import solve_dwell_table  # noqa: PLC0415
-    from northfinder.estimation.triad import static_mean  # noqa: PLC0415
+    from northfinder.estimation.triad import static_mean_of  # noqa: PLC0415
     from northfinder.table_report import dwell_table_json, triad_json  # noqa: PLC0415
 
     if isinstance(table, StaticTriad):
-        means = [static_mean(position.name, position.rate, position.specific_force) for position in table.positions]
+        means = [static_mean_of(position.name, position.pieces) for position in table.positions]
         return triad_json(solve_triad(means, latitude=latitude))
     if input_axis_offset is None:
         input_axis_offset = stated_input_axis_offset(table.metadata) or 0.0

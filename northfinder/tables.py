@@ -80,11 +80,20 @@ class DwellTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriadPosition:
-    """What a triad at rest measured in one position."""
+    """What a triad at rest measured in one position, in the pieces that it was read in."""
 
     name: str
-    rate: Array  #: rad/s, shape (n, 3)
-    specific_force: Array  #: m/s^2, shape (n, 3)
+    pieces: tuple[Array, ...]  #: rates in rad/s and specific forces in m/s^2, body axes x, y, z, shape (6, n) each
+
+    @property
+    def rate(self) -> Array:
+        """All rates, rad/s, shape (n, 3)."""
+        return np.hstack([piece[:3] for piece in self.pieces]).T
+
+    @property
+    def specific_force(self) -> Array:
+        """All specific forces, m/s^2, shape (n, 3)."""
+        return np.hstack([piece[3:] for piece in self.pieces]).T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,7 +175,8 @@ def _triad(file: BinaryIO, header: Header) -> StaticTriad:
     for name, columns in read_rows(file, header, indices, label):
         if not runs or runs[-1][0] != name:
             runs.append((name, []))
-        runs[-1][1].append(columns * factors[:, np.newaxis])
+        np.multiply(columns, factors[:, np.newaxis], out=columns)
+        runs[-1][1].append(columns)
         if len(runs) > MAX_POSITIONS:
             raise RecordError(
                 f"there are more than {MAX_POSITIONS} positions: is column 'position' a name per position?"
@@ -183,7 +193,5 @@ def _positions(runs: list[tuple[str, list[Array]]]) -> list[TriadPosition]:
         name = label or "static"
         name = name if name not in used else f"{name}_{n}"
         used.add(name)
-        columns = np.hstack(pieces)
-        pieces.clear()
-        positions.append(TriadPosition(name=name, rate=columns[:3].T, specific_force=columns[3:].T))
+        positions.append(TriadPosition(name=name, pieces=tuple(pieces)))
     return positions

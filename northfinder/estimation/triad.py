@@ -15,7 +15,7 @@ known) is moved by its own standard deviation up and down, added in squares.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,15 +95,24 @@ def static_mean(name: str, rate: ArrayLike, specific_force: ArrayLike) -> Static
     EstimateError
         With fewer than 10 samples.
     """
-    columns = [*np.asarray(rate).T, *np.asarray(specific_force).T]
-    n = len(columns[0])
+    return static_mean_of(name, [np.vstack([np.asarray(rate).T, np.asarray(specific_force).T])])
+
+
+def static_mean_of(name: str, pieces: Sequence[Array]) -> StaticMean:
+    """Return what `static_mean` does, of samples in pieces, (6, n) each: rates and specific forces one by one."""
+    n = sum(piece.shape[1] for piece in pieces)
     if n < MIN_SAMPLES:
         raise EstimateError(f"position {name!r} has {n} samples, expected at least {MIN_SAMPLES}")
     n_batches = min(N_BATCHES, n // 2)
-    n_used = n - n % n_batches
-    batches = np.array([column[:n_used].reshape(n_batches, -1).mean(axis=1) for column in columns])
-    mean = np.array([column.mean() for column in columns])
-    sd = batches.std(axis=1, ddof=1) / math.sqrt(n_batches)
+    size = n // n_batches
+    sums, start = np.zeros((6, n_batches + 1)), 0  # the last one is of what is left over
+    for piece in pieces:
+        first, last = (min(at // size, n_batches) for at in (start, start + piece.shape[1] - 1))
+        cuts = np.maximum(np.arange(first, last + 1) * size - start, 0)
+        sums[:, first : last + 1] += np.add.reduceat(piece, cuts, axis=1)
+        start += piece.shape[1]
+    mean = sums.sum(axis=1) / n
+    sd = (sums[:, :-1] / size).std(axis=1, ddof=1) / math.sqrt(n_batches)
     return StaticMean(
         name=name,
         rate=mean[:3],
