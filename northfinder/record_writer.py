@@ -21,6 +21,8 @@ STALL_TIMEOUT = 60.0
 CLOSE_TIMEOUT = 60.0
 #: How long a program that reads may hold up the tidying at the end, in s; the record is complete without it.
 TIDY_TIMEOUT = 2.0
+#: After so many transactions, 10 s of them, the log is copied to the file.
+CHECKPOINT_COMMITS = 100
 #: So many bytes of samples may wait for the disk.
 MAX_WAITING_BYTES = 1 << 27
 
@@ -54,6 +56,7 @@ def _open(path: Path, doing: str, *, create_tables: bool) -> tuple[sqlite3.Conne
             db.execute(f"PRAGMA page_size = {PAGE_SIZE}")
         db.execute("PRAGMA synchronous = EXTRA")  # FULL, and no journal comes back after the power has failed
         db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA wal_autocheckpoint = 0")  # SQLite would keep its failures to itself
         if create_tables:
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
@@ -107,6 +110,8 @@ class Writer(threading.Thread):
         self._error: str | None = None
         self._stalled = False
         self._told = False
+        self.checkpoint_commits = CHECKPOINT_COMMITS
+        self._n_commits = 0
 
     @property
     def delay(self) -> float:
@@ -167,6 +172,9 @@ class Writer(threading.Thread):
             for table, rows in batches:
                 self._db.executemany(INSERT[table], rows)
             self._db.execute("COMMIT")
+            self._n_commits += 1
+            if self._n_commits % self.checkpoint_commits == 0:
+                self._db.execute("PRAGMA wal_checkpoint(PASSIVE)")
         except Exception as error:  # noqa: BLE001  # whatever it is, it must be told, not die with this thread
             self._error = str(error)
             with suppress(sqlite3.Error):
