@@ -124,7 +124,7 @@ def test_recording_as_noise(tmp_path: Path) -> None:
 
 def test_profiles_that_come_with_it() -> None:
     """The emulator's own profiles parse and are called what their files are."""
-    assert profile_names() == ["fast3", "ideal", "tvg43"]
+    assert profile_names() == ["fast3", "ideal", "kvh", "m-g370", "stim300", "triad", "tvg43"]
     assert [load_profile(name).name for name in profile_names()] == profile_names()
 
 
@@ -153,5 +153,5 @@ def test_profile_errors_name_key_and_file(tmp_path: Path, old: str, new: str, me
 
 def test_no_such_profile() -> None:
     """A name that is neither a profile nor a file is refused with the names there are."""
-    with pytest.raises(ValueError, match="no profile 'tvg44': neither one of fast3, ideal, tvg43 nor a readable file"):
+    with pytest.raises(ValueError, match=r"no profile 'tvg44': neither one of fast3, ideal, .*, tvg43 nor a readable file"):
         load_profile("tvg44")

@@ -6,6 +6,7 @@ live     processor time of transport, driver and record at 2,000 samples/s of th
 estimate time of an estimate from 16 min and from 24 h of 1 s means
 stim300  frames a second decoded; processor time of transport, driver and record at 2,000 samples/s
 kvh      frames a second decoded
+epson    frames a second decoded
 plan     wall time of ``northfinder plan`` with its plot
 help     wall time of ``northfinder --help``
 """
@@ -24,7 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from bench_gyros import bench_kvh, bench_stim300
+from bench_gyros import bench_epson, bench_kvh, bench_stim300
 
 from drivers.api import ByteLink
 from drivers.native import NativeGyro, open_gyro
@@ -50,6 +51,7 @@ LIMITS = {
     "stim300_frames_per_s": 5e5,
     "stim300_live_cpu_percent": 6.0,
     "kvh_frames_per_s": 5e5,
+    "epson_frames_per_s": 5e5,
     "plan_wall_s": 5.0,
     "help_wall_s": 0.5,
 }
@@ -196,6 +198,7 @@ BENCHES: dict[str, Callable[[], dict[str, float]]] = {
     "estimate": bench_estimate,
     "stim300": bench_stim300,
     "kvh": bench_kvh,
+    "epson": bench_epson,
     "plan": bench_plan,
     "help": bench_help,
 }

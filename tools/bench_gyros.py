@@ -1,4 +1,4 @@
-"""Measure the gyros that send by themselves; run by ``python tools/bench.py stim300 kvh``.
+"""Measure the gyros that send by themselves; run by ``python tools/bench.py stim300 kvh epson``.
 
 Decoding: what an emulated unit sends in 200 s, in chunks of 4096 bytes as a port hands them over, to arrays of counts.
 Live: the processor time of transport, driver and record in this process at 2,000 samples/s.
@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.discovery import open_gyro
-from drivers.protocol import kvh, stim300
-from drivers.protocol.crc_frames import CrcFrameDecoder, Frames
+from drivers.frame_stream import FrameDecoder
+from drivers.protocol import epson, kvh, stim300
+from drivers.protocol.crc_frames import Frames
 from drivers.transport.clock import SystemClock
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.recorder import Recorder
@@ -29,9 +30,17 @@ LIVE_SECONDS = 20.0
 _CHUNK = 4096
 
 
-def frames_per_second(kind: str, decoder: Callable[[], CrcFrameDecoder], counts: Callable[[Frames], NDArray]) -> float:  # type: ignore[type-arg]  # integers or floats
-    """Return how many frames a second are decoded to counts, the best of five runs."""
+def frames_per_second(
+    kind: str,
+    decoder: Callable[[], FrameDecoder],
+    counts: Callable[[Frames], NDArray],  # type: ignore[type-arg]  # integers or floats
+    *,
+    prepare: bytes = b"",
+) -> float:
+    """Return how many frames a second are decoded to counts, the best of five runs; `prepare` makes the unit send."""
     line = SimBench(gyro=kind, seed=1).gyro
+    if prepare:
+        line.feed(prepare, 0)
     wire = b"".join(line.poll(second * 1_000_000) for second in range(SENT_SECONDS))
     best, n_frames = math.inf, 0
     for _ in range(5):
@@ -61,6 +70,26 @@ def bench_kvh() -> dict[str, float]:
         return kvh.decode_messages(frames)["rotation"].astype(np.float32)
 
     return {"kvh_frames_per_s": frames_per_second("kvh", kvh.decoder, counts)}
+
+
+def bench_epson() -> dict[str, float]:
+    """Time decoding of bursts of 32-bit numbers."""
+    settings = (
+        (epson.UART_CTRL[1], 1),
+        (epson.BURST_CTRL1[1], epson.BURST_FIELDS & 0xFF),
+        (epson.BURST_CTRL1[1] + 1, epson.BURST_FIELDS >> 8),
+        (epson.BURST_CTRL2[1] + 1, epson.BURST_WIDTHS[32]),
+    )
+    prepare = epson.select_window(1) + b"".join(epson.write_command(*setting) for setting in settings)
+    prepare += epson.select_window(0) + epson.write_command(epson.MODE_CTRL[1] + 1, epson.SAMPLING)
+
+    def counts(frames: Frames) -> NDArray[np.int32]:
+        return epson.records([frames])["rate"].astype(np.int32)
+
+    def decoder() -> epson.BurstDecoder:
+        return epson.BurstDecoder(epson.MODELS["G370PDS0"])
+
+    return {"epson_frames_per_s": frames_per_second("epson", decoder, counts, prepare=prepare)}
 
 
 def live(kind: str) -> dict[str, float]:
