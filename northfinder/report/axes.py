@@ -11,6 +11,8 @@ from northfinder.report.charts import Band, Chart, Intervals, Item, Levels
 
 #: Stretches between the ticks of an axis, at most.
 _ACROSS, _UPWARD = 9, 6
+#: Part of the vertical axis that is left to the names of steps.
+_NAMES = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,8 @@ def axes_of(chart: Chart) -> tuple[Axis, Axis]:
     """Return the horizontal and the vertical axis of a chart: as it says, or so that everything is seen."""
     x = chart.x_range or _range([_x(item) for item in chart.items], chart, margin=0.0)
     y = chart.y_range or _range([_y(item) for item in chart.items], chart, margin=0.06)
+    if chart.y_range is None and any(mark.name for mark in chart.marks):
+        y = y[0], y[1] + _NAMES * (y[1] - y[0])
     return Axis(*x, chart.logarithmic, _ACROSS, 1.0 if chart.numbered else 0.0), Axis(*y, chart.logarithmic)
 
 
