@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,10 +55,12 @@ def matrix_from_rotation_vector(vector: ArrayLike) -> Matrix:
     return turn
 
 
+@lru_cache(maxsize=16)
 def pedestal_attitude(site: Site) -> Matrix:
-    """Return mat_np: the tilt in the pedestal's own axes, then the heading about the vertical."""
+    """Return mat_np: the tilt in the pedestal's own axes, then the heading about the vertical. Not to be written to."""
     tilt_x, tilt_y = site.tilt
     mat: Matrix = matrix_about_z(site.heading) @ matrix_from_rotation_vector((tilt_y, -tilt_x, 0.0))
+    mat.flags.writeable = False
     return mat
 
 
