@@ -153,5 +153,5 @@ def test_profile_errors_name_key_and_file(tmp_path: Path, old: str, new: str, me
 
 def test_no_such_profile() -> None:
     """A name that is neither a profile nor a file is refused with the names there are."""
-    with pytest.raises(ValueError, match=r"no profile 'tvg44': neither one of fast3, ideal, .*, tvg43 nor a readable file"):
+    with pytest.raises(ValueError, match=r"no profile 'tvg44': neither one of fast3, .*, tvg43 nor a readable file"):
         load_profile("tvg44")

@@ -192,10 +192,12 @@ class BurstDecoder:
     def __init__(self, model: Model, bits: int = 32) -> None:
         self._dtype = _DTYPES[bits]
         self._size = self._dtype.itemsize
-        self._words = (self._size - 4) // 2
+        self._weights = np.zeros(self._size, np.float32)  # of the bytes in the sum
+        self._weights[1 : self._size - 3] = [256, 1] * ((self._size - 4) // 2)
         coldest, hottest = model.temperature_range()
         self._temperatures = (coldest, hottest) if bits == 32 else (coldest // _FINE, hottest // _FINE)
         self._counts = CrcFrameCounts()
+        self._in_step = True  # whether the last place tried held a burst
         self._rest = b""
 
     @property
@@ -231,20 +233,16 @@ class BurstDecoder:
         """Return the good bursts that stand one after the other from `start` on, shape (n, size)."""
         if buffer[start + self._size - 1] != DELIMITER:
             return np.empty((0, self._size), np.uint8)
-        n = (len(buffer) - start) // self._size
-        for n_tried in (1, n):  # among junk the first look decides, and costs little
-            rows = np.ndarray((n_tried, self._size), np.uint8, buffer, start)
-            bad = np.flatnonzero(~self._check(rows))
-            n_good = int(bad[0]) if len(bad) else n_tried
-            if n_good < n_tried or n == 1:
-                break
-        return rows[:n_good]
+        n = (len(buffer) - start) // self._size if self._in_step else 1  # among junk a look costs little
+        rows = np.ndarray((n, self._size), np.uint8, buffer, start)
+        good = self._check(rows)
+        self._in_step = bool(good[0])
+        return rows if good.all() else rows[: int(good.argmin())]
 
     def _check(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Return which rows are bursts."""
         bursts = rows.view(self._dtype)[:, 0]
-        words = np.ndarray((len(rows), self._words), ">u2", rows, 1, (self._size, 2))
-        sums = words.sum(axis=1, dtype=np.uint32) & 0xFFFF
+        sums = (rows @ self._weights).astype(np.uint32) & 0xFFFF  # exact: below 2^24
         good: NDArray[np.bool_] = (bursts["sum"] == sums) & (bursts["header"] == HEADER[0])
         good &= bursts["delimiter"] == DELIMITER
         good &= bursts["flags"] & ALL_NEW == ALL_NEW
@@ -254,7 +252,7 @@ class BurstDecoder:
 
 def records(frames: list[Frames]) -> NDArray[np.void]:
     """Return bursts as records with the fields of the layout, shape (n,)."""
-    rows = np.concatenate([run.bodies for run in frames])
+    rows = np.concatenate([run.bodies for run in frames]) if len(frames) > 1 else frames[0].bodies
     bits = next(bits for bits, size in BURST_SIZE.items() if size == rows.shape[1])
     found: NDArray[np.void] = rows.view(_DTYPES[bits])[:, 0]
     return found
