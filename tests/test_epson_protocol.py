@@ -123,7 +123,7 @@ def test_impossible_bursts_are_refused(bad: bytes) -> None:
 
 
 def test_damage_that_the_sum_lets_through() -> None:
-    """Of bursts of random bytes with a right sum the seven flags alone let one in 128 pass, with the temperature less."""
+    """Of random bursts with a right sum the seven flags let one in 128 pass, and the temperature fewer."""
     rng = random.Random(1)
     bodies = [rng.randbytes(32) for _ in range(8_000)]
     wire = b"".join(
