@@ -51,12 +51,6 @@ _GYROS = {f"gyro_{axis}": _RATE for axis in "xyz"}
 _TRIAD = _GYROS | {f"accel_{axis}": _ACCELERATION for axis in "xyz"}
 
 
-def stated_latitude(metadata: Mapping[str, str]) -> float | None:
-    """Return the latitude in rad that a ``# latitude_deg: NUMBER`` line states, None without one."""
-    found = re.match(r"[+-]?\d{1,2}(\.\d+)?(?![\d.])", metadata.get("latitude_deg", ""), re.ASCII)
-    return math.radians(float(found[0])) if found and abs(float(found[0])) <= 90.0 else None
-
-
 def stated_input_axis_offset(metadata: Mapping[str, str]) -> float | None:
     """Return the angle in rad of "points at stage_azimuth_deg + ANGLE" in a comment, None without one."""
     pattern = r"points at stage_azimuth_deg ([+-]) (\d{1,3}(?:\.\d+)?)(?![\d.]*\d)"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from northfinder import delimited
 from northfinder.errors import RecordError
-from northfinder.tables import DwellTable, StaticTriad, read_table, stated_latitude
+from northfinder.tables import DwellTable, StaticTriad, read_table
 
 DPH = math.pi / 180.0 / 3600.0
 DWELLS = "dwell,stage_azimuth_deg,elevation_deg,duration_s,rate_dph\n0,90,0,2.5,-9.5\n1,270,-30,2.5,8.25\n"
@@ -91,12 +91,10 @@ def test_marks_of_other_systems_are_no_hindrance(tmp_path: Path, dress: object) 
 
 
 def test_comments_are_offered_as_metadata(tmp_path: Path) -> None:
-    """A stated latitude can be asked for, and is none where the comment states none."""
+    """Key and value of each comment that has a colon."""
     table = read_dwells(tmp_path, "# run: T1\n# latitude_deg: -49.5 (by map)\n\n" + DWELLS)
     assert table.metadata["run"] == "T1"
-    assert stated_latitude(table.metadata) == pytest.approx(math.radians(-49.5))
-    for other in ({}, {"latitude_deg": "unknown"}, {"latitude_deg": "91"}, {"latitude_deg": "4951"}):
-        assert stated_latitude(other) is None
+    assert table.metadata["latitude_deg"] == "-49.5 (by map)"
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ estimate time of an estimate from 16 min and from 24 h of 1 s means
 stim300  frames a second decoded; processor time of transport, driver and record at 2,000 samples/s
 kvh      frames a second decoded
 epson    frames a second decoded
+table    wall time and memory of ``solve`` on a static triad as CSV, an hour at 2,000 samples/s
 plan     wall time of ``northfinder plan`` with its plot
 help     wall time of ``northfinder --help``
 """
@@ -52,6 +53,7 @@ LIMITS = {
     "stim300_live_cpu_percent": 6.0,
     "kvh_frames_per_s": 5e5,
     "epson_frames_per_s": 5e5,
+    "table_wall_s": 3.0,
     "plan_wall_s": 5.0,
     "help_wall_s": 0.5,
 }
@@ -178,6 +180,27 @@ def bench_estimate() -> dict[str, float]:
     return figures
 
 
+def bench_table() -> dict[str, float]:
+    """Time a triad turned over after half an hour; each half minute is a copy, which the reader does not know."""
+    rng = np.random.default_rng(1)
+    names = "position,time_s,gyro_x_dph,gyro_y_dph,gyro_z_dph,accel_x_ms2,accel_y_ms2,accel_z_ms2\n"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "triad.csv"
+        with path.open("w", encoding="ascii") as file:
+            file.write(names)
+            for position, sign in (("up", 1.0), ("down", -1.0)):
+                rate = np.array([sign * 11.7, 5.0, -3.0 * sign]) + 40.0 * rng.standard_normal((60_000, 3))
+                force = np.array([sign * 9.806, 0.01, 0.06 * sign]) + 0.003 * rng.standard_normal((60_000, 3))
+                rows = zip(rate.round(4).tolist(), force.round(6).tolist(), strict=True)
+                text = "".join(
+                    f"{position},{i / 2000:.4f},{','.join(map(repr, (*w, *a)))}\n" for i, (w, a) in enumerate(rows)
+                )
+                for _ in range(60):
+                    file.write(text)
+        wall, memory = run_timed(["solve", str(path), "--json"])
+        return {"table_wall_s": wall, "table_memory_mb": memory, "table_size_mb": path.stat().st_size / 1e6}
+
+
 def bench_plan() -> dict[str, float]:
     """Time the search for the best plan of 16 min, latitude included, with its plot."""
     with tempfile.TemporaryDirectory() as folder:
@@ -199,6 +222,7 @@ BENCHES: dict[str, Callable[[], dict[str, float]]] = {
     "stim300": bench_stim300,
     "kvh": bench_kvh,
     "epson": bench_epson,
+    "table": bench_table,
     "plan": bench_plan,
     "help": bench_help,
 }

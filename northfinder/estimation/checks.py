@@ -92,7 +92,7 @@ def closures(means: RateMeans, covariance: Array, sd_dof: float) -> list[Check]:
     axes = sensitivity(means.azimuth, means.elevation, means.tilt, n_axes=means.n_axes)
     found: dict[str, list[tuple[float, float]]] = {"pair sums": [], "repeated positions": []}
     for axis in range(means.n_axes):
-        groups = _positions(axes[:, axis])
+        groups = positions(axes[:, axis])
         contrasts = {"pair sums": _pair_sums(groups, axes[:, axis]), "repeated positions": _repeats(groups)}
         for name, of_kind in contrasts.items():
             found[name] += [contrast.applied(means.rate[:, axis], covariance) for contrast in of_kind]
@@ -112,8 +112,11 @@ class _Contrast:
         return float(self.weights @ rate[self.dwells]), math.sqrt(max(float(variance), 0.0))
 
 
-def _positions(axes: Array) -> list[list[int]]:
-    """Return the dwells of each position, the positions in the order they were first taken."""
+def positions(axes: Array) -> list[list[int]]:
+    """Return the rows of each position, the positions in the order they were first taken.
+
+    A row holds the components of one input axis, or of several one after the other.
+    """
     groups: list[list[int]] = []
     for i, axis in enumerate(axes):
         same = [group for group in groups if np.linalg.norm(axes[group[0]] - axis) < SAME_POSITION]

@@ -12,7 +12,7 @@ long as they were not all about the vertical; those need the turn angles, as in 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,7 @@ from northfinder.estimation.triad import (
 from northfinder.units import DPH, EARTH_RATE
 
 Array = NDArray[np.float64]
+_STEPS, _CONVERGED = 20, 1e-13  # of Gauss-Newton, in units of x
 #: In the body frame of each position, (n, 3) each: a level direction, that 90 deg clockwise of it from above, and up.
 Level = tuple[Array, Array, Array]
 
@@ -177,8 +178,8 @@ class _Problem:
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
         return inputs[:n].reshape(-1, 3), (ahead, np.cross(ahead, up), up), inputs[2 * n : -3]
 
-    def fit(self, inputs: Array, start: Array) -> tuple[Array, float, Array]:
-        """Return x, chi square and Jacobian of the least squares that begins at `start`."""
+    def equations(self, inputs: Array) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+        """Return the whitened residuals, and their Jacobian, as functions of x."""
         rate, level, value = self.split(inputs)
         known_sd = np.maximum(self.known_sd, 1e-7)
         n = len(rate)
@@ -194,8 +195,24 @@ class _Problem:
             by_x[range(n), :, range(4, 4 + n)] = math.cos(x[3]) * _north(level, x[4:] + math.pi / 2.0)
             return np.vstack([by_x.reshape(3 * n, -1) / self.noise, self.known / known_sd[:, np.newaxis]])
 
+        return residuals, jacobian
+
+    def fit(self, inputs: Array, start: Array) -> tuple[Array, float, Array]:
+        """Return x, chi square and Jacobian of the least squares that begins at `start`."""
+        residuals, jacobian = self.equations(inputs)
         found = least_squares(residuals, start, jacobian, method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
         return found.x, 2.0 * float(found.cost), found.jac
+
+    def refitted(self, inputs: Array, start: Array) -> Array:
+        """Return x for inputs a little off those that gave `start`, by Gauss-Newton: many times faster than `fit`."""
+        residuals, jacobian = self.equations(inputs)
+        x = start.copy()
+        for _ in range(_STEPS):
+            step = np.linalg.lstsq(jacobian(x), residuals(x), rcond=None)[0]
+            x -= step
+            if np.max(np.abs(step)) < _CONVERGED:
+                break
+        return x
 
     def starts(self, inputs: Array) -> list[Array]:
         """Return where to begin: no bias, and biases around the mean rate, with the headings these would give."""
@@ -264,7 +281,7 @@ def _solve(problem: _Problem, inputs: Array) -> tuple[Array, float]:
 
 def _outputs(problem: _Problem, inputs: Array, start: Array) -> Array:
     """Return biases / Omega, latitude and for each position azimuth and elevation of x, y, z."""
-    x, _, _ = problem.fit(inputs, start)
+    x = problem.refitted(inputs, start)
     _, level, _ = problem.split(inputs)
     axes = [directions(north, up) for north, up in zip(_north(level, x[4:]), level[2], strict=True)]
     return np.concatenate([x[:4], *axes])

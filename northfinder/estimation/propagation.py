@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from northfinder.estimation.checks import SAME_POSITION
+from northfinder.estimation.checks import positions
 from northfinder.estimation.fix import Fix, Known
 from northfinder.estimation.geometry import rates_jacobian, sensitivity
 from northfinder.estimation.least_squares import MEASURES_VERTICAL, Weights, fit_best, known_bias
@@ -152,7 +152,7 @@ class Propagation:
         The error of a stage belongs to the position: it is the same at each visit.
         """
         means = self.design.means
-        position = _positions(self.design.sensitivity.reshape(means.n, -1))
+        visits = positions(self.design.sensitivity.reshape(means.n, -1))
         columns = []
         for angle in of:
             ends = []
@@ -161,7 +161,7 @@ class Propagation:
                 angles[angle] = angles[angle] + step
                 ends.append(sensitivity(**angles, tilt=means.tilt, n_axes=means.n_axes) @ rates)
             change = (ends[0] - ends[1]) / (2.0 * _ANGLE_STEP)
-            columns += [change * (position == p)[:, np.newaxis] for p in range(position.max() + 1)]
+            columns += [change * np.isin(np.arange(means.n), rows)[:, np.newaxis] for rows in visits]
         return self.through(np.stack(columns, axis=2))
 
     def by_misalignment(self, rates: Array) -> Array:
@@ -205,15 +205,3 @@ def _at_most(means: RateMeans, n: int) -> RateMeans:
     group = np.cumsum(np.concatenate([[0], (np.diff(run) != 0) | (np.diff(place // together) != 0)]))
     parts = {field.name: getattr(means, field.name) for field in fields(means)}
     return RateMeans(**parts | {"dwell": group}).per_dwell()
-
-
-def _positions(axes: Array) -> NDArray[np.int64]:
-    """Return the number of the position of each row of input axes, shape (n,)."""
-    found: list[Array] = []
-    numbers = np.empty(len(axes), dtype=np.int64)
-    for i, row in enumerate(axes):
-        near = (p for p, known in enumerate(found) if np.linalg.norm(known - row) < SAME_POSITION)
-        numbers[i] = next(near, len(found))
-        if numbers[i] == len(found):
-            found.append(row)
-    return numbers
