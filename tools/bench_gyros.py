@@ -44,9 +44,9 @@ def frames_per_second(
     wire = b"".join(line.poll(second * 1_000_000) for second in range(SENT_SECONDS))
     best, n_frames = math.inf, 0
     for _ in range(5):
-        started, reader = time.perf_counter(), decoder()
+        started, reader = time.process_time(), decoder()
         found = [counts(run) for i in range(0, len(wire), _CHUNK) for run in reader.feed(wire[i : i + _CHUNK])]
-        best = min(best, time.perf_counter() - started)
+        best = min(best, time.process_time() - started)
         n_frames = sum(map(len, found))
     return n_frames / best
 

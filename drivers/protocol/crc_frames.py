@@ -147,7 +147,7 @@ def _count_good(rows: NDArray[np.uint8]) -> int:
     width = body + -body % 4
     padded = np.zeros((len(rows), width), np.uint8)
     padded[:, :body] = rows[:, :body]
-    data = memoryview(padded.tobytes())
+    data = padded.tobytes()
     wanted = np.ascontiguousarray(rows[:, body:]).view(">u4")[:, 0].tolist()
     mpeg_2 = crc32.mpeg_2
     for n_good, crc in enumerate(wanted):
