@@ -13,8 +13,8 @@ A real unit that sends angles (https://github.com/TRECVT/ros_kvh1750):
 >>> wire = bytes.fromhex("fe81ff553b041f78b9b96613ba234b38bb7c0410b8def4803f7f4b7b701f001df12fb6ee")
 >>> [frames] = decoder().feed(wire)
 >>> message = decode_messages(frames)
->>> message["rotation"].tolist()
-[[0.0020160358399152756, -0.00035362067865207791, -0.0006229133345186710]]
+>>> [f"{angle:.6e}" for angle in message["rotation"][0]]
+['2.016036e-03', '-3.536207e-04', '-6.229133e-04']
 >>> hex(int(message["status"][0])), message["sequence"].tolist(), message["temperature"].tolist()
 ('0x70', [31], [29])
 """
