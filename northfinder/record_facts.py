@@ -73,8 +73,10 @@ def _steps_done(record: Record) -> str:
 
     An outline holds the steps itself or in its cyclogram.
     """
-    plan = record.meta("plan") or {}
-    planned = len((plan.get("cyclogram") or plan).get("steps", []))
+    plan = record.meta("plan")
+    outline = (plan.get("cyclogram") or plan) if isinstance(plan, dict) else None
+    steps = outline.get("steps") if isinstance(outline, dict) else None
+    planned = len(steps) if isinstance(steps, list) else 0
     return f"{len(record.steps())} of the {planned} steps" if planned else f"{len(record.steps())} steps"
 
 

@@ -84,8 +84,9 @@ def solve_record(
             assumptions.calibration.check(gyro_identity(record), record_date(record))
         means = reduce_record(record).means()
         fix = solve(means, assumptions)
-        plan = record.meta("plan") or {}
-        about = {"plan": plan.get("name"), "record": str(path)} | completeness(record)
+        plan = record.meta("plan")
+        name = plan.get("name") if isinstance(plan, dict) else None
+        about = {"plan": name, "record": str(path)} | completeness(record)
         result = fix_to_json(fix) | supplement(means, assumptions, fix) | about
         return result | kept_bearings(record, result, place)
 
@@ -93,7 +94,13 @@ def solve_record(
 def kept_bearings(record: Record, result: dict[str, Any], place: Place | None = None) -> dict[str, Any]:
     """Return grid azimuth and magnetic bearing of the result of a record, nothing if no place is given or kept."""
     place = place or Place.from_json(record.meta("place"))
-    return {} if place is None else bearings_json(place, result, record_date(record))
+    if place is None:
+        return {}
+    try:
+        date = record_date(record)
+    except (OverflowError, OSError, ValueError):
+        raise RecordError(f"the record {record.path} is damaged: it ends at a date that cannot be") from None
+    return bearings_json(place, result, date)
 
 
 def kept_assumptions(record: Record) -> Assumptions:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
+import shutil
+import sqlite3
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -22,11 +25,12 @@ from virtual import Unwatched, assume, virtual_bench
 from drivers.api import DeviceIdentity
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.cli import cli
-from northfinder.errors import ConfigError
+from northfinder.errors import ConfigError, RecordError
 from northfinder.estimation.allan import averaging_factors, overlapping_allan_deviation
 from northfinder.estimation.means import RateMeans
 from northfinder.geodesy import Place
 from northfinder.measurement import Measurement, measure
+from northfinder.record_schema import INSERT, NAMES, sealed
 from northfinder.report.axes import Axis
 from northfinder.report.charts import broken, charts, dwell_pairs, pooled_allan
 from northfinder.report.compass import rose
@@ -341,6 +345,42 @@ def test_a_record_without_an_azimuth_has_a_report(early: Path) -> None:
     assert "do not determine" in page.text
     assert "Rate against time" in page.text
     assert "Allan deviation" not in page.text
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value", "readable"),
+    [
+        ("step", "sample_rate", 0.0, False), ("step", "sample_rate", 1e308, False),
+        ("step", "stream_start", -1e308, False), ("step", "stop_index", 0, False), ("step", "name", "<b>\x1b", True), ("event", "time", 1e300, True),
+        ("stage_state", "elevation", math.inf, True), ("stage_state", "device_time", -1e308, True),
+        ("block", "temperature", 1e308, True), ("meta", "value", "[[[]]]", None), ("fix", "value", "3", True),
+    ],
+)  # fmt: skip
+def test_a_record_that_cannot_be_is_one_sentence(
+    early: Path,
+    tmp_path: Path,
+    table: str,
+    column: str,
+    value: object,
+    readable: bool | None,  # noqa: FBT001  # a case
+) -> None:
+    """Rows with sound seals and absurd values give a page, or a RecordError: never anything else."""
+    for number in range(1, 7 if table == "meta" else 2):
+        path = tmp_path / f"{number}.sqlite"
+        shutil.copy(early, path)
+        with contextlib.closing(sqlite3.connect(path)) as db, db:
+            row = list(db.execute(f"SELECT {NAMES[table]} FROM {table} WHERE id = ?", (number,)).fetchone())  # noqa: S608
+            names = [each.strip() for each in NAMES[table].split(",")]
+            row[names.index(column)] = value
+            db.execute(f"DELETE FROM {table} WHERE id = ?", (number,))  # noqa: S608  # names of ours
+            db.execute(INSERT[table], sealed(table, number, row[1:-1]))
+        refusal = ""
+        try:
+            check_self_contained(Page(record_page(gather_record(path))))
+        except RecordError as error:
+            refusal = str(error)
+        assert readable in {None, not refusal}
+        assert not refusal or str(path) in refusal
 
 
 def test_three_axes_and_many_dwells(axes: Path) -> None:

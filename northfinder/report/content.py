@@ -219,6 +219,9 @@ def summary_rows(report: RecordReport) -> list[tuple[str, str]]:
     rows.append(("plan", f"{name}, {report.result['steps']}"))
     if report.dwells:
         rows.append(("end of the last dwell", f"{report.dwells[-1].stop / 60:.1f} min after the first sample"))
+    if report.n_streams > 1:
+        often = "once" if report.n_streams == 2 else f"{report.n_streams - 1} times"
+        rows.append(("resumed", f"{often}, after an interruption"))
     n_samples = sum(dwell.n_samples for dwell in report.dwells)
     lost = f", {report.n_missing} missing" if report.n_missing else ", none missing"
     unfit = f", {report.n_unfit} declared unfit by the gyro" if report.n_unfit else ""

@@ -35,6 +35,8 @@ _BATCH_SAMPLES = 1 << 16
 #: States of the stage that are drawn, and events that are listed.
 _MAX_STATES = 3000
 MAX_EVENTS = 200
+#: No sample rate, time or angle of a measurement is as large, in SI.
+_UNHEARD_OF = 1e9
 #: Events that are the course of every measurement and tell nothing by themselves.
 _ROUTINE = {"state"}
 
@@ -94,6 +96,7 @@ class RecordReport:
     n_events: int  #: of those worth telling
     n_unfit: int = 0
     n_missing: int = 0
+    n_streams: int = 1  #: one more than the measurement was interrupted and resumed
 
     @property
     def truth(self) -> tuple[float, float] | None:
@@ -113,6 +116,7 @@ def gather_record(path: Path, place: Place | None = None) -> RecordReport:
     with Record(path) as record:
         watch, reduction = _Watch(), Reduction()
         for span in record.steps():
+            _require_possible(record, span)
             columns = record.columns_of(span)
             reduction.add_columns(span, columns)
             if columns is not None:
@@ -132,8 +136,17 @@ def gather_record(path: Path, place: Place | None = None) -> RecordReport:
             meta={name: record.meta(name) for name in ("northfinder", "plan", "config", "simulation", "sample_rate")},
             events=tuple(told[:MAX_EVENTS]),
             n_events=len(told),
+            n_streams=record.count("stream"),
             **estimate,
         )
+
+
+def _require_possible(record: Record, span: DwellSpan) -> None:
+    """Raise RecordError for a dwell that cannot have been: a record may come from anywhere."""
+    times = (span.stream_start, span.dwell, span.measured_azimuth, span.measured_elevation)
+    possible = 0.0 < span.sample_rate < _UNHEARD_OF and all(abs(each) < _UNHEARD_OF for each in times)
+    if not (possible and 0 <= span.first_index < span.stop_index):
+        raise RecordError(f"the record {record.path} is damaged: dwell {span.step} has no possible time or position")
 
 
 def _estimate(record: Record, reduction: Reduction, place: Place | None) -> dict[str, Any]:
@@ -266,7 +279,7 @@ def _stage_path(record: Record, spans: list[DwellSpan]) -> StagePath | None:
         ]
         if offsets:
             shifted[own] = time[own] + np.median(offsets)
-    kept = np.flatnonzero(np.isfinite(shifted))
+    kept = np.flatnonzero(np.max(np.abs([shifted, azimuth, elevation]), axis=0) < _UNHEARD_OF)
     kept = kept[_corners(np.column_stack([azimuth, elevation])[kept])]
     return StagePath(time=shifted[kept], azimuth=azimuth[kept], elevation=elevation[kept]) if len(kept) else None
 
