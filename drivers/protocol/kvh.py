@@ -14,7 +14,7 @@ A real unit that sends angles (https://github.com/TRECVT/ros_kvh1750):
 >>> [frames] = decoder().feed(wire)
 >>> message = decode_messages(frames)
 >>> [f"{angle:.6e}" for angle in message["rotation"][0]]
-['2.016036e-03', '-3.536207e-04', '-6.229133e-04']
+['2.016036e-03', '-3.536200e-04', '-6.229165e-04']
 >>> hex(int(message["status"][0])), message["sequence"].tolist(), message["temperature"].tolist()
 ('0x70', [31], [29])
 """
