@@ -351,7 +351,8 @@ def test_a_record_without_an_azimuth_has_a_report(early: Path) -> None:
     ("table", "column", "value", "readable"),
     [
         ("step", "sample_rate", 0.0, False), ("step", "sample_rate", 1e308, False),
-        ("step", "stream_start", -1e308, False), ("step", "stop_index", 0, False), ("step", "name", "<b>\x1b", True), ("event", "time", 1e300, True),
+        ("step", "stream_start", -1e308, False), ("step", "stop_index", 0, False),
+        ("step", "name", "<b>\x1b", True), ("event", "time", 1e300, True),
         ("stage_state", "elevation", math.inf, True), ("stage_state", "device_time", -1e308, True),
         ("block", "temperature", 1e308, True), ("meta", "value", "[[[]]]", None), ("fix", "value", "3", True),
     ],
