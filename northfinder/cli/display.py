@@ -90,6 +90,11 @@ class SilentDisplay:
         print(text, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
 
 
+def _live(console: Console) -> Live:
+    """Return a live view that leaves the program's own streams alone: it may get stuck, and they must not."""
+    return Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False, redirect_stderr=False)
+
+
 class DisplayContext(AbstractContextManager[Display]):
     """Chooses the display for this terminal, and takes it down at the end."""
 
@@ -108,7 +113,7 @@ class DisplayContext(AbstractContextManager[Display]):
         """
         console = console or Console(stderr=True)
         live = console.is_terminal and not quiet
-        self._live = Live(console=console, auto_refresh=False, transient=True) if live else None
+        self._live = _live(console) if live else None
         self._context: AbstractContextManager[object] = self._live or nullcontext()
         self._display: Display = SilentDisplay() if quiet else PlainDisplay()
         if self._live is not None:
