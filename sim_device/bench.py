@@ -21,7 +21,7 @@ from sim_device.plant.boards import SimGyroBoard, SimStageBoard
 from sim_device.plant.earth import Site
 from sim_device.plant.gyro import STREAM_ACCELEROMETERS, STREAM_STAGE, STREAM_TILT, Gyro, seed_of
 from sim_device.plant.noise import NoiseSource
-from sim_device.plant.profile import Profile, load_profile
+from sim_device.plant.profile import Profile, load_profile, with_parked_stage
 from sim_device.plant.stage import Stage
 
 NOISE_BATCH = 8192  #: samples made at a time
@@ -130,6 +130,8 @@ class World:
         Of the rotation axis, rad, see the convention sheet in ``northfinder``.
     noise
         Of each gyro axis, instead of the profile's.
+    parked
+        Whether the stage stands at zero when it is switched on, as a mount does that never turns.
 
     """
 
@@ -145,8 +147,11 @@ class World:
         latitude: float = 0.0,
         tilt: tuple[float, float] = (0.0, 0.0),
         noise: list[NoiseSource] | None = None,
+        parked: bool = False,
     ) -> None:
         self.profile = profile if isinstance(profile, Profile) else load_profile(profile)
+        if parked:
+            self.profile = with_parked_stage(self.profile)
         self.seed = seed
         self.now_us = 0
         self.site = Site(latitude=latitude, heading=azimuth, tilt=tilt)

@@ -47,7 +47,7 @@ class ServeOptions:
     latitude_deg: float = 50.429
     tilt_arcsec: tuple[float, float] = (0.0, 0.0)
     speed: float = 1.0  #: times real time, inf for as fast as the host keeps up
-    only: str = ""  #: "gyro" or "stage", both if empty
+    only: str = ""  #: "gyro" or "stage", both if empty; a gyro alone stands on a mount at azimuth and elevation zero
     tcp: str = ""  #: address to listen on, pseudo-terminals if empty
     bus: str = ""  #: "socketcand" or "slcan" for a CAN bus, serial lines if empty
     bitrate: int = BITRATE  #: of the CAN bus
@@ -82,6 +82,7 @@ def _world(options: ServeOptions) -> dict[str, Any]:
         "azimuth": math.radians(options.azimuth_deg),
         "latitude": math.radians(options.latitude_deg),
         "tilt": (options.tilt_arcsec[0] * ARCSEC, options.tilt_arcsec[1] * ARCSEC),
+        "parked": options.only == "gyro",
     }
 
 
@@ -239,7 +240,7 @@ def main(arguments: list[str] | None = None) -> int:
     add("--latitude", type=float, default=50.429, help="deg, north positive")
     add("--tilt", type=_parse_tilt, default=(0.0, 0.0), metavar="X,Y", help="lean of the rotation axis, arcsec")
     add("--speed", type=parse_speed, default=1.0, metavar="X|max", help="times real time, at least 1")
-    add("--only", choices=["gyro", "stage"], default="", help="serve this device alone")
+    add("--only", choices=["gyro", "stage"], default="", help="serve this device alone; a gyro then stands at zero")
     add("--tcp", nargs="?", const=LOOPBACK, default="", metavar="HOST", help="TCP instead of pseudo-terminals")
     add("--bus", choices=BUSES, default="", help="a CAN bus instead of serial lines")
     add("--bitrate", type=int, default=BITRATE, help="of the CAN bus, bit/s")

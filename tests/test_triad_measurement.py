@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -220,3 +223,27 @@ def test_without_a_terminal_nobody_can_be_asked() -> None:
     """Said before a port is opened."""
     with pytest.raises(ConfigError, match="there is no terminal to ask at: give --stage"):
         TerminalOperator(SystemClock(), print)
+
+
+def test_find_needs_no_stage(tmp_path: Path) -> None:
+    """The whole command on the emulated triad, and a plan that needs a stage told so."""
+    find = [sys.executable, "-m", "northfinder", "find"]
+    asked = ["--plan", "static", "--time", "60", "--speed", "max", "--seed", "2", "--json", "--quiet"]
+    ran = subprocess.run([*find, *asked, "--out", str(tmp_path)], capture_output=True, check=False, timeout=300)
+    assert ran.returncode == 0, ran.stderr
+    result = json.loads(ran.stdout)
+    assert abs(result["azimuth_deg"] - 33.0) < 4.0 * result["azimuth_sd_deg"]
+    assert 0.5 < result["azimuth_sd_deg"] < 1.0
+    refused = subprocess.run(
+        [*find, "--gyro", "native:/dev/none", "--plan", "six-position"], capture_output=True, check=False, timeout=300
+    )
+    assert refused.returncode == 2
+    assert b"the plan six-position turns the gyro on a stage: give --stage" in refused.stderr
+
+
+def test_the_emulator_serves_a_gyro_alone_at_zero() -> None:
+    """What stands on no stage stands where the truth says, not where a stage happens to be switched on."""
+    axes = (SimBench("tvg43", seed=1, parked=True).plant_stage, SimBench("tvg43", seed=1).plant_stage)
+    parked, anywhere = (abs(stage.azimuth.true_angle(0)) for stage in axes)
+    assert parked < 1e-3
+    assert anywhere > 0.1

@@ -25,6 +25,7 @@ class SimulationOptions:
     speed: str
     gyro: str = "native"  #: which instruments, see `sim_device.instruments`
     stage: str = "native"
+    only: str = ""  #: "gyro" for one without a stage
     bus: str = ""  #: "socketcand" or "slcan" for a CAN bus, serial lines if empty
 
 
@@ -39,6 +40,7 @@ class EmulatorProcess:
                 "--azimuth", repr(options.azimuth_deg), "--latitude", repr(options.latitude_deg),
                 "--gyro", options.gyro, "--stage", options.stage,
                 "--profile", options.profile, "--seed", str(options.seed), "--speed", options.speed,
+                *(("--only", options.only) if options.only else ()),
                 *(("--bus", options.bus) if options.bus else ()),
             ],
             stdin=subprocess.PIPE,

@@ -194,6 +194,7 @@ class Options:
         return SimulationOptions(
             gyro=self.sim_gyro,
             stage=self.sim_stage,
+            only="gyro" if self.plan == "static" else "",
             azimuth_deg=self.sim_azimuth,
             latitude_deg=self.sim_latitude,
             profile=self._emulated_profile(),

@@ -133,6 +133,13 @@ class IdentifiedProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     scale_factor_sd: NotNegative = 0.0
 
 
+def with_parked_stage(profile: Profile) -> Profile:
+    """Return the bench with a stage that stands at zero when it is switched on."""
+    stage = profile.stage
+    axes = {name: msgspec.structs.replace(getattr(stage, name), power_up_deg=0.0) for name in ("azimuth", "elevation")}
+    return msgspec.structs.replace(profile, stage=msgspec.structs.replace(stage, **axes))
+
+
 def profile_names() -> list[str]:
     """Return the names of the profiles that come with the emulator."""
     folder = resources.files(__package__) / "profiles"
