@@ -17,8 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
-from scipy.integrate import trapezoid
+from scipy import special
 
 from northfinder.errors import EstimateError
 from northfinder.estimation.noise import NoiseModel
@@ -93,8 +92,8 @@ def allan_curve(rate: ArrayLike, sample_rate: float, noise: NoiseModel, *, confi
     return AllanCurve(
         tau=tau,
         deviation=deviation,
-        low=deviation * np.sqrt(edf / stats.chi2.ppf(1.0 - tail, edf)),
-        high=deviation * np.sqrt(edf / stats.chi2.ppf(tail, edf)),
+        low=deviation * np.sqrt(edf / special.chdtri(edf, tail)),
+        high=deviation * np.sqrt(edf / special.chdtri(edf, 1.0 - tail)),
         edf=edf,
         confidence=confidence,
     )
@@ -110,7 +109,8 @@ def degrees_of_freedom(noise: NoiseModel, n_samples: int, factor: int, period: f
     coarse = np.geomspace(4.0, max(4.0, n / factor), 200)
     lag = np.unique(np.minimum(np.round(np.concatenate([fine, coarse]) * factor), n - 1))
     smooth = _second_difference_covariance(noise, lag * period, factor * period)
-    total = 2.0 * float(trapezoid((n - lag) * smooth**2, lag))  # half of lag 0, both signs of all others
+    weighted = (n - lag) * smooth**2
+    total = float(np.sum((weighted[1:] + weighted[:-1]) * np.diff(lag)))  # half of lag 0, both signs of all others
     variance = smooth[0] + 6.0 * noise.angle_white_noise**2
     for at, share in ((0, 6.0), (factor, -4.0), (2 * factor, 1.0)):  # where two second differences share an angle
         here = float(np.interp(at, lag, smooth))
