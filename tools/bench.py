@@ -3,6 +3,7 @@
 find     wall time and memory of a whole ``find --speed max``, both processes' start included
 decode   bytes of the wire to arrays
 live     processor time of transport, driver and record at 2,000 samples/s of three axes
+record   processor time of the recorder alone at 2,000 samples/s of three axes; size and ``solve`` of an hour of it
 estimate time of an estimate from 16 min and from 24 h of 1 s means
 stim300  frames a second decoded; processor time of transport, driver and record at 2,000 samples/s
 kvh      frames a second decoded
@@ -22,13 +23,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from bench_gyros import bench_epson, bench_kvh, bench_stim300
 
-from drivers.api import ByteLink
+from drivers.api import ByteLink, RateBlock
 from drivers.native import NativeGyro, open_gyro
 from drivers.protocol.framing import FrameDecoder
 from drivers.protocol.native import decode_samples
@@ -36,6 +37,7 @@ from drivers.transport.clock import SystemClock
 from drivers.transport.virtual import VirtualClock, VirtualLink
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.estimation import RateMeans
+from northfinder.record import DwellSpan
 from northfinder.recorder import Recorder
 from northfinder.solution import Assumptions, solve
 from northfinder.units import DPH
@@ -47,6 +49,9 @@ LIMITS = {
     "find_memory_mb": 150.0,
     "decode_samples_per_s": 1e6,
     "live_cpu_percent": 5.0,
+    "record_cpu_percent": 2.0,
+    "record_hour_mb": 120.0,
+    "record_hour_solve_s": 3.0,
     "estimate_16_min_s": 0.03,
     "estimate_24_h_s": 2.0,
     "stim300_frames_per_s": 5e5,
@@ -154,6 +159,50 @@ def bench_live() -> dict[str, float]:
     return {"live_cpu_percent": 100 * cpu / wall, "live_samples_per_s": rate, "live_samples_lost": lost}
 
 
+def fast_blocks(seconds: float) -> Iterator[RateBlock]:
+    """Yield blocks of 39 samples of three axes at 2,000 samples/s, at rest in four positions, half a minute each."""
+    noise = np.random.default_rng(1).normal(0.0, 300 * DPH, (200, 39, 3))
+    for number in range(round(seconds * 2000 / 39)):
+        first = 39 * number
+        azimuth = first // 60_000 % 4 * np.pi / 2
+        rate = noise[number % 200] + 9 * DPH * np.array([np.cos(azimuth + 0.5), -np.sin(azimuth + 0.5), 1.0])
+        yield RateBlock(
+            first_index=first, device_time=first / 2000, arrival_time=first / 2000, rate_lsb=1e-9,
+            counts=np.asarray(rate / 1e-9, dtype=np.int32), temperature=25.0 + 1e-4 * number, tilt=(1e-5, 1.3e-5),
+        )  # fmt: skip
+
+
+def bench_record() -> dict[str, float]:
+    """Record in real time, with nothing else to do; then an hour as fast as it goes, and solve that."""
+    clock = SystemClock()
+    with tempfile.TemporaryDirectory() as folder:
+        blocks = list(fast_blocks(LIVE_SECONDS))
+        with Recorder(Path(folder) / "live.sqlite", time.time, clock=clock.now) as recorder:
+            started, cpu = clock.now(), time.process_time()
+            for block in blocks:
+                clock.sleep_until(started + block.arrival_time)
+                recorder.add_block(block)
+            cpu, wall = time.process_time() - cpu, clock.now() - started
+        path = Path(folder) / "hour.sqlite"
+        with Recorder(path, lambda: 1e9, clock=clock.now) as recorder:
+            assumptions = Assumptions.gather(method="generalised", profile="tvg43", latitude_deg=50.0, g_drift_dph=None)
+            recorder.set_meta("assumptions", assumptions)
+            recorder.begin_stream({}, sample_rate=2000.0, n_axes=3)
+            for block in fast_blocks(3600.0):
+                recorder.add_block(block)
+            for number in range(119):
+                azimuth, first = number % 4 * np.pi / 2, 60_000 * number + 6000
+                recorder.add_step(
+                    DwellSpan(
+                        step=number, name="", azimuth=azimuth, elevation=0.0, dwell=27.0, measured_azimuth=azimuth,
+                        measured_elevation=0.0, first_index=first, stop_index=first + 54_000, sample_rate=2000.0,
+                    )
+                )  # fmt: skip
+        solving = statistics.median(run_timed(["solve", str(path), "--json"])[0] for _ in range(3))
+        size = path.stat().st_size / 1e6
+    return {"record_cpu_percent": 100 * cpu / wall, "record_hour_mb": size, "record_hour_solve_s": solving}
+
+
 def four_positions(seconds: int) -> RateMeans:
     """Return means of 1 s on four positions in turn, 27 s each and 3 s a turn, with white noise."""
     second = np.arange(seconds)
@@ -218,6 +267,7 @@ BENCHES: dict[str, Callable[[], dict[str, float]]] = {
     "find": bench_find,
     "decode": bench_decode,
     "live": bench_live,
+    "record": bench_record,
     "estimate": bench_estimate,
     "stim300": bench_stim300,
     "kvh": bench_kvh,
