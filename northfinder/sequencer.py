@@ -74,6 +74,9 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
 STOP_TIMEOUT = 5.0
 #: How often the devices are served at least while nothing arrives, in s; heartbeats hang on it.
 SERVICE_PERIOD = 0.05
+#: Dwells begin at whole multiples of this in the gyro's samples, in s: so a stage that comes to rest a moment sooner or
+#: later, as over another bus, does not move the samples that a dwell holds.
+DWELL_GRID = 1.0
 #: Stage time within which homing must end, in s.
 HOME_TIMEOUT = 180.0
 #: Stage time beyond twice its calculated duration within which a slew must end, in s.
@@ -160,6 +163,8 @@ class Sequencer:
     _place: StreamPlace = field(default_factory=StreamPlace)
     _step: Step | None = None
     _next_index: int = 0  #: one past the newest sample
+    _first: int = 0  #: first sample of the present or coming dwell
+    _newest: RateBlock | None = None
     _blocks: list[RateBlock] = field(default_factory=list)  #: of the present dwell
     _state: StageState | None = None
     _now: State = State.CONNECT
@@ -282,18 +287,21 @@ class Sequencer:
         # The block being filled when the stage came to rest still holds samples of the slew: settling starts with
         # the block after it.
         self._serve_until_index(self._next_index + 1)
-        self._serve_until_index(self._next_index + round(self.settle * self._devices()[0].sample_rate))
+        rate = self._devices()[0].sample_rate
+        settled, grid = self._next_index + round(self.settle * rate), max(1, round(DWELL_GRID * rate))
+        self._first = -(-settled // grid) * grid
+        self._serve_until_index(self._first)
         return Event.OK
 
     def _dwell(self) -> Event:
         step = self._present_step()
-        first = self._next_index
+        first = self._first
         rate = self._devices()[0].sample_rate
         stop = first + round(step.dwell * rate)
         if step.deadline is not None:
             stop = min(stop, math.floor((step.deadline - self.earlier.elapsed) * rate))
         stop = max(stop, first + 1)
-        self._blocks = []
+        self._blocks = [] if self._newest is None or self._next_index <= first else [self._newest]
         states: list[StageState] = [self._service_stage()]
 
         def done() -> bool:
@@ -410,6 +418,7 @@ class Sequencer:
                 self._place = self._placed(blocks[0])
             for block in blocks:
                 self.recorder.add_block(block)
+                self._newest = block
                 self._next_index = block.first_index + len(block.counts)
                 if first is not None and block.first_index < stop and self._next_index > first:
                     self._blocks.append(block)

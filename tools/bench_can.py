@@ -59,11 +59,11 @@ def emulated_gyro() -> Iterator[str]:
             yield emulator.announcement()["gyro"].removeprefix("canopen-gyro:")
 
 
-def bench_live(name: str, block_samples: int | None) -> dict[str, float]:
+def bench_live(name: str, block_duration: float) -> dict[str, float]:
     """Measure this process while it reads and records the gyro in real time."""
     clock = SystemClock()
     with emulated_gyro() as place, tempfile.TemporaryDirectory() as folder:
-        gyro = open_gyro(place, clock, block_samples=block_samples)
+        gyro = open_gyro(place, clock, block_duration=block_duration)
         with Recorder(Path(folder) / "live.sqlite", time.time) as recorder, contextlib.closing(gyro):
             gyro.connect()
             gyro.start()
@@ -103,7 +103,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     arguments = parser.parse_args()
-    figures = bench_find() | bench_live("can_live", None) | bench_live("can_live_single", 1) | bench_python_can()
+    figures = bench_find() | bench_live("can_live", 0.2) | bench_live("can_live_single", 0.0) | bench_python_can()
     if arguments.json:
         print(json.dumps(figures))
         return

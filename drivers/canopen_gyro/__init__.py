@@ -18,10 +18,13 @@ def open_gyro(
     *,
     baudrate: int = DEFAULT_BAUDRATE,
     sample_rate: float | None = None,
-    block_samples: int | None = None,
+    block_duration: float = 0.5,
     max_silence: float = MAX_SILENCE,
 ) -> Gyro:
     """Open the bus of a gyro; `connect` then speaks to it. `baudrate` is that of an slcan adapter's serial port.
+
+    Bursts of `block_duration` s are asked for, as of a gyro on a serial line: a dwell begins with a whole block, so the
+    dwells of both hold the same samples.
 
     Raises
     ------
@@ -33,4 +36,6 @@ def open_gyro(
     where = parse_node_address(address, 1)
     node = where.nodes[0]
     link = open_bus(where.bus, clock, accept=[base + node for base in IDENTIFIERS], baudrate=baudrate)
-    return CanopenGyro(link, clock, node, sample_rate=sample_rate, block_samples=block_samples, max_silence=max_silence)
+    return CanopenGyro(
+        link, clock, node, sample_rate=sample_rate, block_duration=block_duration, max_silence=max_silence
+    )

@@ -12,6 +12,7 @@ from drivers.protocol.native import RATE_LSB
 
 EDS = "gyro.eds"
 LONGEST_PAUSE = 1.0  # s without samples, or five blocks if that is longer
+MAX_BURST = 255  # samples
 BLOCK_TIME = 0.2  # s, of a gyro that sends its samples in shorter bursts
 IDENTIFIERS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x500, 0x580, 0x700)  #: to which the node's number is added
 
@@ -38,8 +39,8 @@ class CanopenGyro:
         The gyro's number on the bus.
     sample_rate
         Samples a second to ask for, None to leave it.
-    block_samples
-        Samples a burst to ask for, None to leave it.
+    block_duration
+        Length of a burst to ask for in s, None to leave it.
     max_silence
         Time without a heartbeat, s, after which the node counts as cut off.
     """
@@ -51,7 +52,7 @@ class CanopenGyro:
         node_id: int,
         *,
         sample_rate: float | None = None,
-        block_samples: int | None = None,
+        block_duration: float | None = None,
         max_silence: float = MAX_SILENCE,
     ) -> None:
         self._clock = clock
@@ -62,7 +63,8 @@ class CanopenGyro:
         self._seen_codec = PdoCodec(node.remote.rpdo[1])
         node.collect(*(codec.cob_id for codec in (*self._axis_codecs, self._mark_codec, self._slow_codec)))
         node.duty = self._acknowledge
-        self._wanted = {_SAMPLE_RATE: round((sample_rate or 0.0) * 1000), _BURST: block_samples or 0}
+        self._wanted_rate_millihz = round((sample_rate or 0.0) * 1000)
+        self._wanted_block = block_duration
         self._sample_rate = self._range = 0.0
         self._n_axes = self._burst = self._block_samples = 0
         self._assembler = SampleAssembler(1, 1.0, 1)
@@ -180,11 +182,12 @@ class CanopenGyro:
     def _configure(self) -> None:
         """Bring the configuration to what was asked for, and read what is in force."""
         node = self._node
-        for index, value in self._wanted.items():
-            if value:
-                node.write(index, 0, value, verify=True)
-        rate, burst, self._n_axes = node.read(_SAMPLE_RATE), node.read(_BURST), node.read(_N_AXES)
-        self._burst = burst
+        if self._wanted_rate_millihz:
+            node.write(_SAMPLE_RATE, 0, self._wanted_rate_millihz, verify=True)
+        rate, self._n_axes = node.read(_SAMPLE_RATE), node.read(_N_AXES)
+        if self._wanted_block is not None:
+            node.write(_BURST, 0, max(1, min(MAX_BURST, round(self._wanted_block * rate / 1000))), verify=True)
+        self._burst = burst = node.read(_BURST)
         if self._n_axes not in {1, 3} or not rate or not burst:
             raise ProtocolError(
                 f"{node.name} reports an impossible configuration: {self._n_axes} axes, {rate} mHz, "
