@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -46,10 +47,23 @@ class Cutter:
         """Cut if this is the moment."""
         self.seen.append(progress)
         if self.at(progress):
+            written(self.record, progress)
             for path in self.record.parent.glob(f"{self.record.name}*"):
                 if not path.name.endswith("-shm"):  # no file but memory shared by processes
                     shutil.copy(path, path.with_name(f"cut-{path.name}"))
             raise PowerCutError
+
+
+def written(path: Path, progress: Progress) -> None:
+    """Wait until the recorder's thread has brought to the file what was handed to it up to this moment."""
+    pause, looks = threading.Event(), 3000
+    for _ in range(looks):
+        with Record(path) as record:
+            states = [detail for _, kind, detail in record.events() if kind == "state"]
+            if states[-1:] == [progress.state.value] and len(record.steps()) == progress.n_done:
+                return
+        pause.wait(0.01)
+    pytest.fail(f"the recorder has not written {progress.state} after {progress.n_done} steps")
 
 
 def dead_gyro(bench: VirtualBench) -> Gyro:
