@@ -227,8 +227,8 @@ def test_gyro_board_reports_tilt_and_time() -> None:
     assert gyro.sample_time_us(235 * 3600) == 5 + 3600 * 1_000_000
 
 
-def test_noise_between_streams_goes_on_by_the_minute() -> None:
-    """A stream that starts a little later meets the same noise; one that starts minutes later meets later noise."""
+def test_noise_between_streams_goes_on() -> None:
+    """A stream that starts a little later meets the same noise; one that starts ten minutes later meets later noise."""
     profile = load_profile("tvg43")
 
     def first_samples(start_us: int) -> bytes:
@@ -246,7 +246,7 @@ def test_noise_between_streams_goes_on_by_the_minute() -> None:
         return board.read_samples(10)
 
     assert first_samples(1_000_000) == first_samples(1_234_567)
-    assert first_samples(1_000_000) != first_samples(61_000_000)
+    assert first_samples(1_000_000) != first_samples(601_000_000)
 
 
 def test_stage_board_counts_from_power_up() -> None:
