@@ -24,7 +24,7 @@ from northfinder.adaptive import Wishes, make_plan
 from northfinder.calibration import Calibration, checked, read_calibration
 from northfinder.cli.aside import Aside
 from northfinder.cli.bench import gyro_of, named_bench, stage_of, stop_on_signal
-from northfinder.cli.display import DisplayContext
+from northfinder.cli.display import DisplayContext, SilentDisplay
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.cli.operator import TerminalOperator
 from northfinder.cli.options import estimation_options, position_options
@@ -109,6 +109,7 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
         stop_requested = stack.enter_context(stop_on_signal(clock))
         shown = DisplayContext(clock, quiet=options.quiet, step_names=plan.step_names, time=plan.time)
         display = stack.enter_context(Aside(shown))
+        watcher = SilentDisplay() if options.quiet else display  # what shows nothing need not run aside
         results: list[dict[str, Any]] = []
         for _ in range(options.repeat):
             begun = time.monotonic() if results else STARTED
@@ -127,7 +128,7 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
                     "place": None if place is None else place.to_json(),
                 },
             )
-            outcome = measure(measurement, clock=clock, utc=time.time, watcher=display, stop_requested=stop_requested)
+            outcome = measure(measurement, clock=clock, utc=time.time, watcher=watcher, stop_requested=stop_requested)
             result = outcome.to_json() | {"plan": plan.name}
             result |= {} if place is None else bearings_json(place, result, _today())
             results.append(result | {"wall_s": round(time.monotonic() - begun, 3)})
