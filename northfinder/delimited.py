@@ -1,33 +1,40 @@
 """Numbers from a file of comma-separated rows, fast when it is well formed and exact about the place when it is not.
 
 A file is UTF-8 text: ``#`` lines are comments, of which ``# key: value`` is kept as metadata; the first other line
-holds the column names; every later line is a row with a number in each wanted column. Reading goes by chunks. A large
-chunk of regular rows goes through Arrow, on all processors; whatever that refuses is read again in smaller chunks, and
-in the end line by line, which either accepts it or names the line and the column.
+holds the column names; every later line is a row with a number in each wanted column. Reading goes by chunks, on all
+processors. A chunk of regular rows goes through Arrow; whatever that refuses is read again line by line, which either
+accepts it or names the line and the column.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import re
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from northfinder.errors import RecordError
 
+if TYPE_CHECKING:
+    from pyarrow import DictionaryArray
+
 MAX_LINE = 65_536  #: bytes; a longer line is no row of a table
 MAX_ROWS = 50_000_000
-_LARGE = 1 << 26  #: bytes read at a time
-_CHUNK = 1 << 22  #: of which a processor takes so many
+_CHUNK = 1 << 22  #: bytes that a processor takes at a time
 _BULK = 1 << 18  #: bytes from which the bulk parser is worth its start
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 Array = NDArray[np.float64]
+#: Consecutive rows with one label: the label, and the wanted columns, shape (len(wanted), n).
+Run = tuple[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,51 +95,39 @@ def read_rows(
         For the first row that does not hold a finite number in each wanted column.
     """
     n_lines, n_rows = header.n_lines, 0
-    while chunk := _whole_lines(file):
-        for name, columns in _rows(chunk, n_lines, header.names, wanted, label):
+    for chunk, bulk in _parsed(file, header.names, wanted, label):
+        for name, columns in _lines(chunk, n_lines, header.names, wanted, label) if bulk is None else bulk:
             n_rows += columns.shape[1]
             yield name, columns
         if n_rows > MAX_ROWS:
             raise RecordError(f"the file has more than {MAX_ROWS} rows")
-        n_lines += _count_lines(chunk)
+        n_lines += chunk.count(b"\n")
+
+
+def _parsed(
+    file: BinaryIO, names: Sequence[str], wanted: Sequence[int], label: int | None
+) -> Iterator[tuple[bytes, list[Run] | None]]:
+    """Yield the chunks in order, each with what `_bulk` says of it; some are read ahead, one a processor."""
+    n_ahead = os.cpu_count() or 1
+    with ThreadPoolExecutor(n_ahead) as pool:
+        ahead: deque[tuple[bytes, Future[list[Run] | None]]] = deque()
+        while chunk := _whole_lines(file):
+            ahead.append((chunk, pool.submit(_bulk_if_large, chunk, names, wanted, label)))
+            if len(ahead) > n_ahead:
+                chunk, bulk = ahead.popleft()
+                yield chunk, bulk.result()
+        yield from ((chunk, bulk.result()) for chunk, bulk in ahead)
 
 
 def _whole_lines(file: BinaryIO) -> bytes:
-    """Return about _LARGE bytes that end with a line, none at the end of the file."""
+    """Return about _CHUNK bytes that end with a line, none at the end of the file."""
     start = file.tell()
-    file.seek(start + _LARGE)
+    file.seek(start + _CHUNK)
     file.readline(MAX_LINE + 1)
     end = file.tell()
     file.seek(start)
     chunk = file.read(end - start)  # at once: these are too many bytes to copy once more
     return chunk + b"\n" if chunk and not chunk.endswith(b"\n") else chunk
-
-
-def _rows(
-    chunk: bytes, n_before: int, names: Sequence[str], wanted: Sequence[int], label: int | None
-) -> Iterator[tuple[str, Array]]:
-    """Yield the runs of a chunk of whole lines: in bulk, or else of its parts, the irregular ones line by line."""
-    whole = _bulk(chunk, names, wanted, label) if len(chunk) >= _BULK else None
-    if whole is not None:
-        yield from whole
-        return
-    for part in _parts(chunk):
-        runs = _bulk(part, names, wanted, label) if len(part) >= _BULK else None
-        yield from _lines(part, n_before, names, wanted, label) if runs is None else runs
-        n_before += _count_lines(part)
-
-
-def _count_lines(chunk: bytes) -> int:
-    return int(np.count_nonzero(np.frombuffer(chunk, dtype=np.uint8) == ord("\n")))
-
-
-def _parts(chunk: bytes) -> Iterator[bytes]:
-    """Yield parts of about _CHUNK bytes that end with a line."""
-    start = 0
-    while start < len(chunk):
-        end = chunk.find(b"\n", start + _CHUNK - 1) + 1 or len(chunk)
-        yield chunk[start:end]
-        start = end
 
 
 def shown(text: str) -> str:
@@ -186,18 +181,19 @@ def _number(field: str, line: int, column: str) -> float:
     return float(field)
 
 
-def _bulk(
-    chunk: bytes, names: Sequence[str], wanted: Sequence[int], label: int | None
-) -> list[tuple[str, Array]] | None:
+def _bulk_if_large(chunk: bytes, names: Sequence[str], wanted: Sequence[int], label: int | None) -> list[Run] | None:
+    return _bulk(chunk, names, wanted, label) if len(chunk) >= _BULK else None
+
+
+def _bulk(chunk: bytes, names: Sequence[str], wanted: Sequence[int], label: int | None) -> list[Run] | None:
     """Return the runs of a chunk of regular rows, as `_lines` would; None if a row is not regular.
 
-    Arrow reads on all processors, and takes some things for rows or numbers that are none here: those are looked for,
-    and left to `_lines`.
+    Arrow takes some things for rows or numbers that are none here: those are looked for, and left to `_lines`.
     """
     import pyarrow as pa  # noqa: PLC0415  # dear to import, and only large files need it
     from pyarrow import csv  # noqa: PLC0415
 
-    if chunk.startswith(b"#") or b"\n#" in chunk or (b"\r" in chunk and chunk.count(b"\r") != chunk.count(b"\r\n")):
+    if b"#" in chunk or b"\0" in chunk or (b"\r" in chunk and chunk.count(b"\r") != chunk.count(b"\r\n")):
         return None
     columns = [str(i) for i in range(len(names))]
     types = {columns[i]: pa.float64() for i in wanted}
@@ -206,24 +202,26 @@ def _bulk(
     try:
         table = csv.read_csv(
             pa.BufferReader(chunk),
-            csv.ReadOptions(column_names=columns, block_size=_CHUNK),
+            csv.ReadOptions(column_names=columns, block_size=len(chunk) + 1, use_threads=False),
             csv.ParseOptions(quote_char=False),
             csv.ConvertOptions(include_columns=list(types), column_types=types, null_values=[]),
         )
     except pa.ArrowInvalid:
         return None
-    runs: list[tuple[str, Array]] = []
+    runs: list[Run] = []
     for batch in table.to_batches():
-        numbers = np.array([batch.column(columns[i]).to_numpy() for i in wanted])
+        # By DLPack: to_numpy would import pandas.
+        numbers = np.array([np.from_dlpack(batch.column(columns[i])) for i in wanted])
         if not math.isfinite(numbers.sum()) and not np.isfinite(numbers).all():
             return None
-        if label is None:
-            runs.append(("", numbers))
-            continue
-        codes = batch.column(columns[label])
-        texts = [text.strip().strip('"') for text in codes.dictionary.to_pylist()]
-        edges = np.flatnonzero(np.diff(codes.indices.to_numpy())) + 1
-        first = np.concatenate([[0], edges])
-        of_runs = codes.indices.to_numpy()[first].tolist()
-        runs += [(texts[code], part) for code, part in zip(of_runs, np.split(numbers, edges, axis=1), strict=True)]
+        runs += [("", numbers)] if label is None else _labelled(numbers, batch.column(columns[label]))
     return runs
+
+
+def _labelled(numbers: Array, labels: DictionaryArray) -> Iterator[Run]:
+    """Yield the runs of rows of the same label."""
+    texts = [text.strip().strip('"') for text in labels.dictionary.to_pylist()]
+    codes = np.from_dlpack(labels.indices)
+    edges = np.flatnonzero(codes[1:] != codes[:-1]) + 1
+    for part, first in zip(np.split(numbers, edges, axis=1), [0, *edges.tolist()], strict=True):
+        yield texts[codes[first]], part

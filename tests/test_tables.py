@@ -237,6 +237,11 @@ def test_the_bulk_parser_leaves_comments_to_the_exact_one() -> None:
     assert delimited._bulk(b"up,1,2\n#up,1,2\n", ["c"] * 3, [1, 2], 0) is None
 
 
+def test_the_bulk_parser_leaves_zero_bytes_to_the_exact_one() -> None:
+    """Text of a label holds none."""
+    assert delimited._bulk(b"\0up,1,2\n", ["c"] * 3, [1, 2], 0) is None
+
+
 @pytest.mark.parametrize("field", [b" up", b'"up"', b"p1", "\u00fcp".encode()])
 def test_the_bulk_parser_reads_a_name_as_the_exact_one_does(field: bytes) -> None:
     """Blanks and quotes are no part of a name; digits and letters of any script are."""
