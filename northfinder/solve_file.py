@@ -8,14 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from northfinder.errors import ConfigError, RecordError
+from northfinder.estimation.means import RateMeans
+from northfinder.estimation.noise import NoiseModel
 from northfinder.geodesy import Place, bearings_json
 from northfinder.record import Record
 from northfinder.record_facts import completeness, gyro_identity, record_date
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, fix_to_json, solve, supplement
 from northfinder.tables import DwellTable, StaticTriad, read_table, stated_input_axis_offset
+
+Array = NDArray[np.float64]
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -35,7 +41,7 @@ def solve_file(
     path : Path
         Told apart by its content, not by its name.
     assumptions : Assumptions, optional
-        In place of those kept in a record; for a table, its latitude is used.
+        In place of those kept in a record; for a table its latitude is used, and for a triad the noise of its profile.
     revise : callable
         What to change of those assumptions.
     input_axis_offset : float, optional
@@ -62,9 +68,11 @@ def solve_file(
         return solve_record(path, assumptions, revise=revise, place=place)
     if place is not None:
         raise ConfigError(f"{path} is a table without a date: a position is for a record")
-    latitude_deg = revise(assumptions or Assumptions()).latitude_deg
-    latitude = None if latitude_deg is None else math.radians(latitude_deg)
-    return _solve_table(read_table(path), latitude, input_axis_offset)
+    revised = revise(assumptions or Assumptions())
+    latitude = None if revised.latitude_deg is None else math.radians(revised.latitude_deg)
+    noise = revised.noise()
+    table = read_table(path, timed=noise is not None)
+    return _solve_table(table, latitude, input_axis_offset, noise)
 
 
 def solve_record(
@@ -112,7 +120,10 @@ def kept_assumptions(record: Record) -> Assumptions:
 
 
 def _solve_table(
-    table: DwellTable | StaticTriad, latitude: float | None, input_axis_offset: float | None
+    table: DwellTable | StaticTriad,
+    latitude: float | None,
+    input_axis_offset: float | None,
+    noise: NoiseModel | None,
 ) -> dict[str, Any]:
     # What only tables need is dear to import, and records are solved much more often.
     from northfinder.estimation.double_gyrocompass import solve_triad  # noqa: PLC0415
@@ -122,10 +133,20 @@ def _solve_table(
 
     if isinstance(table, StaticTriad):
         means = [static_mean_of(position.name, position.pieces) for position in table.positions]
-        return triad_json(solve_triad(means, latitude=latitude))
+        covariance = None if noise is None or len(means) == 1 else _covariance(table, noise)
+        return triad_json(solve_triad(means, latitude=latitude, rate_covariance=covariance))
     if input_axis_offset is None:
         input_axis_offset = stated_input_axis_offset(table.metadata) or 0.0
     fix = solve_dwell_table(
         table.azimuth, table.elevation, table.rate, input_axis_offset=input_axis_offset, latitude=latitude
     )
     return dwell_table_json(fix) | {"input_axis_offset_deg": math.degrees(input_axis_offset)}
+
+
+def _covariance(table: StaticTriad, noise: NoiseModel) -> Array:
+    """Return the covariance of the mean rates of a gyro over the positions, rad^2/s^2."""
+    start, duration = np.array([position.interval for position in table.positions], dtype=np.float64).T
+    zero = np.zeros(start.size)
+    n_samples = [sum(piece.shape[1] for piece in position.pieces) for position in table.positions]
+    means = RateMeans(start=start, duration=duration, rate=zero, azimuth=zero, elevation=zero, n_samples=n_samples)
+    return noise.covariance(means)

@@ -12,6 +12,7 @@ dwell table             ``stage_azimuth_*``, ``elevation_*``                ``de
 static triad            ``gyro_x_*``, ``gyro_y_*``, ``gyro_z_*``            ``dph``, ``deg_s``, ``rad_s``
                         ``accel_x_*``, ``accel_y_*``, ``accel_z_*``         ``ms2`` (m/s^2), ``g``
                         ``position``, if there: names the position
+                        ``time_s``, read where a noise model needs it       ``s``
 ======================  ==================================================  ==========================================
 
 Rows are in the order of time. ``# key: value`` lines are offered as metadata. Of them only one thing is used unasked:
@@ -78,6 +79,7 @@ class TriadPosition:
 
     name: str
     pieces: tuple[Array, ...]  #: rates in rad/s and specific forces in m/s^2, body axes x, y, z, shape (6, n) each
+    interval: tuple[float, float] | None = None  #: start and duration, s, if they were asked for
 
     @property
     def rate(self) -> Array:
@@ -98,8 +100,8 @@ class StaticTriad:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_table(path: Path) -> DwellTable | StaticTriad:
-    """Read a table of either kind, told apart by the names of its columns.
+def read_table(path: Path, *, timed: bool = False) -> DwellTable | StaticTriad:
+    """Read a table of either kind, told apart by the names of its columns; if `timed`, when a triad's positions were.
 
     Raises
     ------
@@ -108,7 +110,7 @@ def read_table(path: Path) -> DwellTable | StaticTriad:
     """
     try:
         with path.open("rb") as file:
-            return _read(file)
+            return _read(file, timed=timed)
     except RecordError as error:
         raise RecordError(f"{printable(str(path))}: {error}") from None
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
@@ -116,12 +118,12 @@ def read_table(path: Path) -> DwellTable | StaticTriad:
         raise RecordError(f"{printable(str(path))}: cannot be read: {reason}") from None
 
 
-def _read(file: BinaryIO) -> DwellTable | StaticTriad:
+def _read(file: BinaryIO, *, timed: bool) -> DwellTable | StaticTriad:
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         raise RecordError("is no regular file")
     header = read_header(file)
     is_triad = any(name.startswith(("gyro_", "accel_")) for name in header.names)
-    return _triad(file, header) if is_triad else _dwells(file, header)
+    return _triad(file, header, timed=timed) if is_triad else _dwells(file, header)
 
 
 def _columns(header: Header, wanted: Mapping[str, Mapping[str, float]]) -> tuple[list[int], Array]:
@@ -162,8 +164,8 @@ def _dwells(file: BinaryIO, header: Header) -> DwellTable:
     return DwellTable(azimuth=azimuth, elevation=elevation, duration=duration, rate=rate, metadata=header.metadata)
 
 
-def _triad(file: BinaryIO, header: Header) -> StaticTriad:
-    indices, factors = _columns(header, _TRIAD)
+def _triad(file: BinaryIO, header: Header, *, timed: bool) -> StaticTriad:
+    indices, factors = _columns(header, _TRIAD | ({"time": {"s": 1.0}} if timed else {}))
     label = next(iter(_places(header, "position")), None)
     runs: list[tuple[str, list[Array]]] = []
     for name, columns in read_rows(file, header, indices, label):
@@ -187,5 +189,13 @@ def _positions(runs: list[tuple[str, list[Array]]]) -> list[TriadPosition]:
         name = label or "static"
         name = name if name not in used else f"{name}_{n}"
         used.add(name)
-        positions.append(TriadPosition(name=name, pieces=tuple(pieces)))
+        interval = _interval(name, np.concatenate([piece[6] for piece in pieces])) if len(pieces[0]) > 6 else None
+        positions.append(TriadPosition(name=name, pieces=tuple(piece[:6] for piece in pieces), interval=interval))
     return positions
+
+
+def _interval(name: str, time: Array) -> tuple[float, float]:
+    """Return start and duration of a position, a sample lasting as long as the mean distance of two."""
+    if not np.all(np.diff(time) > 0.0):
+        raise RecordError(f"position {shown(name)}: time_s does not grow from row to row")
+    return float(time[0]), float(time[-1] - time[0]) * time.size / max(time.size - 1, 1)

@@ -90,6 +90,23 @@ def test_marks_of_other_systems_are_no_hindrance(tmp_path: Path, dress: object) 
     np.testing.assert_allclose(read_dwells(tmp_path, dress(DWELLS.encode())).rate, [-9.5 * DPH, 8.25 * DPH])
 
 
+def test_the_times_of_positions_are_read_where_they_are_needed(tmp_path: Path) -> None:
+    """Start, and a duration in which each sample lasts as long as two are apart; times that go back are refused."""
+    rows = [f"{name},{time},1,2,3,9.8,0,0" for name, time in (("up", 5.0), ("up", 5.5), ("down", 8.0), ("down", 8.25))]
+    path = tmp_path / "timed.csv"
+    path.write_text("\n".join([TRIAD.splitlines()[0], *rows]))
+    table = read_table(path, timed=True)
+    assert isinstance(table, StaticTriad)
+    assert [position.interval for position in table.positions] == [(5.0, 1.0), (8.0, 0.5)]
+    assert [position.rate.shape for position in table.positions] == [(2, 3), (2, 3)]
+    path.write_text("\n".join([TRIAD.splitlines()[0], *reversed(rows)]))
+    with pytest.raises(RecordError, match="position 'down': time_s does not grow"):
+        read_table(path, timed=True)
+    path.write_text(f"{TRIAD_NAMES}\n1,2,3,9.8,0,0\n")
+    with pytest.raises(RecordError, match="column time is missing"):
+        read_table(path, timed=True)
+
+
 def test_comments_are_offered_as_metadata(tmp_path: Path) -> None:
     """Key and value of each comment that has a colon."""
     table = read_dwells(tmp_path, "# run: T1\n# latitude_deg: -49.5 (by map)\n\n" + DWELLS)

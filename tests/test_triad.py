@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +14,19 @@ from scipy.spatial.transform import Rotation
 
 from northfinder.errors import EstimateError
 from northfinder.estimation.double_gyrocompass import double_gyrocompass, solve_triad
+from northfinder.estimation.means import RateMeans
+from northfinder.estimation.noise import NoiseModel
 from northfinder.estimation.triad import AxisDirection, StaticMean, TriadFix, gyrocompass, static_mean
+from northfinder.profile import find_profile
+from northfinder.solution import Assumptions
+from northfinder.solve_file import solve_file
 from northfinder.table_report import triad_json
 
 Array = NDArray[np.float64]
 
 OMEGA = 7.292115e-5
 DPH = math.pi / 180.0 / 3600.0
+KINDS = ("gyro", "rad_s"), ("accel", "ms2")
 NO_BIAS = np.zeros(3)
 
 
@@ -238,6 +245,29 @@ def test_stated_sd_of_two_positions_holds() -> None:
         assert BOUNDS[0] < rms < BOUNDS[1]
 
 
+def test_correlated_noise_of_the_positions_is_weighed_and_stated() -> None:
+    """Four positions of a gyro that wanders: the sd hold with its covariance, and the errors are smaller with it."""
+    rng = np.random.default_rng(14)
+    attitudes = [attitude(*a) for a in ((70, 80, 10), (150, -75, 25), (20, 5, 95), (300, 10, -85))]
+    start, zero = np.array([0.0, 60.0, 120.0, 900.0]), np.zeros(4)
+    spans = RateMeans(start=start, duration=[60.0, 60.0, 60.0, 600.0], rate=zero, azimuth=zero, elevation=zero)
+    wander = NoiseModel.from_field_units(
+        angle_random_walk_deg_per_sqrt_h=0.001, bias_instability_dph=0.02, rate_random_walk_dph_per_sqrt_h=0.4
+    )
+    covariance = wander.covariance(spans)
+    errors = []
+    for _ in range(70):
+        noise = rng.multivariate_normal(zero, covariance, 3).T
+        means = [mean_of(mat, 40.0, BIAS + of, 0.001 * DPH) for mat, of in zip(attitudes, noise, strict=True)]
+        fixes = double_gyrocompass(means, rate_covariance=covariance), double_gyrocompass(means)
+        stated = normalised_errors(fixes[0], attitudes, 40.0)[:2]
+        errors.append([*stated, *((fix.latitude - math.radians(40.0)) for fix in fixes)])
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    limit = 4.0 / math.sqrt(2.0 * 70)
+    assert np.all(np.abs(rms[:2] - 1.0) < limit), rms
+    assert rms[2] < 0.9 * rms[3]
+
+
 def test_stated_sd_of_one_position_holds() -> None:
     """With the bias stated, latitude and azimuth scatter by at least what is said and at most a third more is said."""
     rng = np.random.default_rng(12)
@@ -287,3 +317,23 @@ def test_the_report_has_every_field_and_no_nan() -> None:
     assert list(report["positions"]) == ["up", "down"]
     for alone in report["positions"].values():
         assert {"axes", "latitude_deg", "latitude_sd_deg", "bias_dph", "combined_axes"} <= set(alone)
+
+
+def test_a_profile_weighs_the_positions_of_a_file(tmp_path: Path) -> None:
+    """Data with hardly any scatter of their own are as sure as the gyro's noise model allows, and a note says so."""
+    rng = np.random.default_rng(15)
+    lines = ["position,time_s," + ",".join(f"{kind}_{axis}_{u}" for kind, u in KINDS for axis in "xyz")]
+    for n, mat in enumerate((attitude(70.0, 80.0, 10.0), attitude(150.0, -75.0, 25.0))):
+        mean = mean_of(mat, 40.0, BIAS)
+        row = np.concatenate([mean.rate, mean.specific_force])
+        noise = rng.normal(0.0, 1e-9, (40, 6))
+        lines += [f"p{n},{60 * n + i}," + ",".join(map(repr, (row + noise[i]).tolist())) for i in range(40)]
+    path = tmp_path / "triad.csv"
+    path.write_text("\n".join(lines))
+    plain = solve_file(path, None)
+    weighed = solve_file(path, Assumptions(profile=find_profile("triad")))
+    assert weighed["latitude_deg"] == pytest.approx(plain["latitude_deg"], abs=0.01)
+    # Two means of 40 s with 0.002 deg/sqrt(h): 0.019 deg/h each of the earth's 15, the latitude 0.05 to 0.15 deg.
+    assert plain["latitude_sd_deg"] < 0.01
+    assert 0.05 < weighed["latitude_sd_deg"] < 0.15
+    assert any("noise model" in note for note in weighed["notes"])

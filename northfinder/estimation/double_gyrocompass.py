@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from northfinder.errors import EstimateError
@@ -34,6 +35,7 @@ from northfinder.estimation.triad import (
 from northfinder.units import DPH, EARTH_RATE
 
 Array = NDArray[np.float64]
+_LEAST_NOISE = 1e-9  # of a mean rate, in units of Omega
 _STEPS, _CONVERGED = 20, 1e-13  # of Gauss-Newton, in units of x
 #: In the body frame of each position, (n, 3) each: a level direction, that 90 deg clockwise of it from above, and up.
 Level = tuple[Array, Array, Array]
@@ -55,6 +57,7 @@ def solve_triad(
     latitude: float | None = None,
     turns: ArrayLike | None = None,
     turn_sd: float = 0.0,
+    rate_covariance: Array | None = None,
 ) -> TriadSolution:
     """Return what one position says, or several by double gyrocompassing; parameters as `double_gyrocompass`.
 
@@ -78,6 +81,7 @@ def solve_triad(
             latitude=latitude,
             turns=turns,
             turn_sd=turn_sd,
+            rate_covariance=rate_covariance,
         )
     if all(axis.azimuth is None for axes in combined.axes for axis in axes):
         raise EstimateError(f"no azimuth: {max((axis.reason for axis in combined.axes[0]), key=len)}")
@@ -95,6 +99,7 @@ def double_gyrocompass(
     latitude: float | None = None,
     turns: ArrayLike | None = None,
     turn_sd: float = 0.0,
+    rate_covariance: Array | None = None,
 ) -> TriadFix:
     """Return latitude, common gyro biases and axis directions from several positions of one body.
 
@@ -114,6 +119,9 @@ def double_gyrocompass(
         Known turn of each position about the vertical, clockwise from above, rad; only their differences matter.
     turn_sd : float
         Standard deviation of each, rad.
+    rate_covariance : (n_positions, n_positions) array, optional
+        Of the mean rates of one gyro, rad^2/s^2, the same for each; in place of the `rate_sd` of the means. A constant
+        in all of it goes into the biases.
 
     Raises
     ------
@@ -123,12 +131,13 @@ def double_gyrocompass(
     for mean in means:
         check_gravity(mean)
     known = _known(len(means), gyro_bias_sd, latitude, turns, turn_sd)
-    problem = _Problem(tuple(means), *known, _reference_axes(means, common=turns is not None))
-    inputs, input_sd = problem.inputs()
-    inputs, input_sd = np.append(inputs, np.zeros(3)), np.append(input_sd, np.full(3, accelerometer_bias_sd))
+    factor = None if rate_covariance is None else _factor(rate_covariance)
+    problem = _Problem(tuple(means), *known, _reference_axes(means, common=turns is not None), factor)
+    inputs, moves = np.append(problem.inputs(), np.zeros(3)), problem.moves(accelerometer_bias_sd)
     solution, ratio = _solve(problem, inputs)
-    values, sd = propagated(lambda moved: _outputs(problem, moved, solution), inputs, input_sd)
+    values, sd = propagated(lambda moved: _outputs(problem, moved, solution), inputs, moves)
     notes = [] if accelerometer_bias_sd else ["accelerometer biases are taken as zero"]
+    notes += [] if factor is None else ["the positions are weighed by the noise model of the gyros"]
     if ratio > 1.0:
         notes.append(f"residuals are {ratio:.2f} times the noise: standard deviations are scaled up by it")
         sd = sd * ratio
@@ -156,17 +165,30 @@ class _Problem:
     known_value: Array  #: shape (k,)
     known_sd: Array  #: shape (k,)
     reference: tuple[int, ...]  #: in each position the body axis whose azimuth is the heading
+    factor: Array | None = None  #: lower, of the covariance of the mean rates of a gyro, (n_positions, n_positions)
 
     @property
-    def noise(self) -> float:
-        """One standard deviation for all mean rates: gyros of a triad are of a kind."""
-        return max(float(np.sqrt(np.mean([mean.rate_sd**2 for mean in self.means]))) / EARTH_RATE, 1e-9)
+    def whitening(self) -> Array:
+        """What makes mean rates of a gyro independent, sd 1, shape (n_positions, n_positions).
 
-    def inputs(self) -> tuple[Array, Array]:
-        """Return the inputs but for the accelerometer biases, and their standard deviations."""
+        Without a covariance one standard deviation serves for all mean rates: gyros of a triad are of a kind.
+        """
+        if self.factor is not None:
+            return np.asarray(np.linalg.inv(self.factor))
+        noise = max(float(np.sqrt(np.mean([mean.rate_sd**2 for mean in self.means]))) / EARTH_RATE, _LEAST_NOISE)
+        return np.eye(len(self.means)) / noise
+
+    def inputs(self) -> Array:
+        """Return the inputs but for the accelerometer biases."""
         rate, force = [mean.rate / EARTH_RATE for mean in self.means], [mean.specific_force for mean in self.means]
-        rate_sd, force_sd = [m.rate_sd / EARTH_RATE for m in self.means], [m.specific_force_sd for m in self.means]
-        return np.concatenate([*rate, *force, self.known_value]), np.concatenate([*rate_sd, *force_sd, self.known_sd])
+        return np.concatenate([*rate, *force, self.known_value])
+
+    def moves(self, accelerometer_bias_sd: float) -> Array:
+        """Return independent moves of all inputs of one standard deviation, as `propagated` takes them."""
+        rate_sd = np.concatenate([mean.rate_sd for mean in self.means]) / EARTH_RATE
+        rates = np.diag(rate_sd) if self.factor is None else np.kron(self.factor, np.eye(3)).T
+        others = [*(mean.specific_force_sd for mean in self.means), self.known_sd, np.full(3, accelerometer_bias_sd)]
+        return np.asarray(block_diag(rates, np.diag(np.concatenate(others))))
 
     def split(self, inputs: Array) -> tuple[Array, Level, Array]:
         """Return rates (n_positions, 3), level directions of each position, known values."""
@@ -182,18 +204,18 @@ class _Problem:
         """Return the whitened residuals, and their Jacobian, as functions of x."""
         rate, level, value = self.split(inputs)
         known_sd = np.maximum(self.known_sd, 1e-7)
-        n = len(rate)
+        n, white = len(rate), self.whitening
 
         def residuals(x: Array) -> Array:
             misfit = x[:3] + _earth(level, x[3], x[4:]) - rate
-            return np.concatenate([misfit.ravel() / self.noise, (self.known @ x - value) / known_sd])
+            return np.concatenate([(white @ misfit).ravel(), (self.known @ x - value) / known_sd])
 
         def jacobian(x: Array) -> Array:
             by_x = np.zeros((n, 3, 4 + n))
             by_x[:, :, :3] = np.eye(3)
             by_x[:, :, 3] = _earth(level, x[3] + math.pi / 2.0, x[4:])
             by_x[range(n), :, range(4, 4 + n)] = math.cos(x[3]) * _north(level, x[4:] + math.pi / 2.0)
-            return np.vstack([by_x.reshape(3 * n, -1) / self.noise, self.known / known_sd[:, np.newaxis]])
+            return np.vstack([(white @ by_x.reshape(n, -1)).reshape(3 * n, -1), self.known / known_sd[:, np.newaxis]])
 
         return residuals, jacobian
 
@@ -243,6 +265,12 @@ def _known(
         rows += [(unknowns[4 + p] - unknowns[4], turned[p] - turned[0], turn_sd) for p in range(1, n_positions)]
     design = np.array([row for row, _, _ in rows]).reshape(-1, 4 + n_positions)
     return design, np.array([value for _, value, _ in rows]), np.array([sd for _, _, sd in rows])
+
+
+def _factor(rate_covariance: Array) -> Array:
+    """Return the lower factor of the covariance in units of Omega."""
+    covariance = rate_covariance / EARTH_RATE**2
+    return np.asarray(np.linalg.cholesky(covariance + _LEAST_NOISE**2 * np.eye(len(covariance))))
 
 
 def _reference_axes(means: Sequence[StaticMean], *, common: bool) -> tuple[int, ...]:

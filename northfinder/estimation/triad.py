@@ -167,7 +167,7 @@ def gyrocompass(mean: StaticMean, *, gyro_bias_sd: float | None = None, accelero
         return np.array([latitude, *directions(unit(horizontal), up)])
 
     inputs = np.concatenate([mean.rate, mean.specific_force])
-    values, sd = propagated(outputs, inputs, np.concatenate([np.sqrt(variance), force_sd]))
+    values, sd = propagated(outputs, inputs, np.diag(np.concatenate([np.sqrt(variance), force_sd])))
     axes = axis_directions(values[1:], sd[1:])
     return TriadFix(names=(mean.name,), axes=(axes,), latitude=values[0], latitude_sd=sd[0], notes=tuple(notes))
 
@@ -198,11 +198,15 @@ def axis_directions(values: Array, sd: Array) -> tuple[AxisDirection, AxisDirect
     return direction(0), direction(1), direction(2)
 
 
-def propagated(outputs: Callable[[Array], Array], inputs: Array, sd: Array) -> tuple[Array, Array]:
-    """Return the outputs, all of them angles, and their standard deviations for independent inputs."""
+def propagated(outputs: Callable[[Array], Array], inputs: Array, moves: Array) -> tuple[Array, Array]:
+    """Return the outputs, all of them angles, and their standard deviations.
+
+    `moves`, shape (k, n_inputs), are independent of each other and of one standard deviation: the diagonal matrix of
+    the standard deviations where the inputs are independent, else the columns of a factor of their covariance.
+    """
     values = outputs(inputs)
     variance = np.zeros_like(values)
-    for step in np.diag(sd)[sd > 0.0]:
+    for step in moves[np.any(moves != 0.0, axis=1)]:
         change = outputs(inputs + step) - outputs(inputs - step)
         variance += (np.remainder(change + math.pi, 2.0 * math.pi) - math.pi) ** 2 / 4.0
     return values, np.sqrt(variance)
