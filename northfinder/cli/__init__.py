@@ -6,6 +6,7 @@ A command's module is imported only when that command runs, so that ``northfinde
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import sys
 import threading
@@ -50,6 +51,14 @@ DISPLAY_THREAD = "display"
 _MODULES = {"show": "show_record"}
 
 
+def _finite(context: click.Context, parameter: click.Parameter, value: object) -> object:
+    """Refuse numbers that are infinite or none: click takes them for numbers, also within a range."""
+    values = value if isinstance(value, tuple) else (value,)
+    if any(isinstance(each, float) and not math.isfinite(each) for each in values):
+        raise click.BadParameter("expected a finite number", context, parameter)
+    return value
+
+
 class _LazyGroup(click.Group):
     """Commands by name, imported when called for."""
 
@@ -63,6 +72,9 @@ class _LazyGroup(click.Group):
             return None
         module = importlib.import_module(f"northfinder.cli.{_MODULES.get(cmd_name, cmd_name)}")
         command: click.Command = module.command
+        for parameter in command.params:
+            if isinstance(parameter.type, click.types.FloatParamType):
+                parameter.callback = _finite
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002

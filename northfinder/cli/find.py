@@ -16,6 +16,7 @@ from typing import Any
 
 import click
 import msgspec
+from click.core import ParameterSource
 
 from drivers.api import Clock, Gyro, Stage
 from drivers.fixed_mount import FixedMount
@@ -32,12 +33,15 @@ from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.config import Config, GyroTable, MeasurementTable, StageTable
 from northfinder.errors import ConfigError
 from northfinder.geodesy import Place, bearings_json
+from northfinder.layouts import PLANS
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
 from northfinder.triad_plans import TRIAD_PLANS, fit_for
 
 #: When the command was given, as near as can be told.
 STARTED = time.monotonic()
+#: Options that say what is emulated, and how.
+EMULATED = {"sim_azimuth", "sim_latitude", "sim_gyro", "sim_stage", "sim_profile", "seed", "speed", "bus"}
 EMULATED_SILENCE = 5.0  #: s without a heartbeat, for which an emulated node is waited
 
 
@@ -174,8 +178,11 @@ class Options:
     def bench(self) -> Config | None:
         """Return the bench that was named, None if none was. Raises ConfigError."""
         named = self.config_file or self.gyro_address or self.stage_address
-        if named and (self.seed is not None or self.bus is not None):
-            raise ConfigError("--seed and --bus are of the emulated bench: leave them out where devices are named")
+        if named and (emulated := _given_for_the_emulator()):
+            verb = "is" if len(emulated) == 1 else "are"
+            raise ConfigError(
+                f"{', '.join(emulated)} {verb} of the emulated bench: to be left out where devices are named"
+            )
         return named_bench(self.gyro_address, self.stage_address, self.config_file)
 
     def emulated_bench(self) -> Config:
@@ -229,7 +236,8 @@ class Options:
     def wishes(self, table: MeasurementTable) -> Wishes:
         """Return what is asked of the plan, by the options or else by the configuration."""
         time_s, dwell_s = self.time_s, self.dwell_s
-        if time_s is None and dwell_s is None:
+        own_dwells = self.plan is not None and self.plan not in (*PLANS, *TRIAD_PLANS)
+        if time_s is None and dwell_s is None and not own_dwells:  # the file's time is not for a plan that is a file
             time_s, dwell_s = table.time_s, table.dwell_s
         until_sd_deg = table.until_sd_deg if self.until_sd_deg is None else self.until_sd_deg
         azimuth_deg = table.azimuth_deg if self.azimuth_deg is None else self.azimuth_deg
@@ -240,6 +248,16 @@ class Options:
             until_sd=None if until_sd_deg is None else math.radians(until_sd_deg),
             azimuth=None if azimuth_deg is None else math.radians(azimuth_deg),
         )
+
+
+def _given_for_the_emulator() -> list[str]:
+    """Return the options for the emulated bench that the command line in hand gives."""
+    context = click.get_current_context()
+    return [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if parameter.name in EMULATED and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
+    ]
 
 
 def _check_speed(text: str) -> None:
