@@ -123,7 +123,7 @@ WRONG = [
     (["find", "--gyro", "native:/dev/null", "--stage", "native:/dev/null"], 3, "/dev/null"),
     (["find", "--gyro", "other:/dev/null", "--stage", "native:/dev/null"], 2, "no gyro driver 'other'"),
     (["find", "--gyro", "native:/dev/null"], 2, "--stage"),
-    (["find", "--gyro", "native:a", "--stage", "native:b", "--seed", "1"], 2, "--seed and --bus are of the emulated"),
+    (["find", "--gyro", "native:a", "--stage", "native:b", "--seed", "1"], 2, "--seed is of the emulated"),
     (["find", "--plan", "five-position"], 2, "no plan 'five-position'"),
     (["find", "--profile", "none.toml"], 2, "no gyro profile 'none.toml'"),
     (["find", "--speed", "slow"], 2, "--speed: found 'slow', expected a number of at least 1, or max"),
