@@ -49,11 +49,11 @@ def test_mems_gyro_on_a_turntable(run: str, azimuth_deg: float, azimuth_sd_deg: 
     assert report["horizontal_rate_dph"] == pytest.approx(9.87, abs=3.0 * report["horizontal_rate_sd_dph"])
 
 
-def solve_ln100(**known: float) -> TriadSolution:
+def solve_ln100(latitude: float | None = None) -> TriadSolution:
     """Solve the ring-laser triad, x up and then x down."""
     table = read_table(recording("ln100_two_position_1hz.csv"))
     assert isinstance(table, StaticTriad)
-    return solve_triad([static_mean(p.name, p.rate, p.specific_force) for p in table.positions], **known)
+    return solve_triad([static_mean(p.name, p.rate, p.specific_force) for p in table.positions], latitude=latitude)
 
 
 def test_ring_laser_triad_in_two_positions() -> None:
