@@ -18,7 +18,7 @@ from northfinder.estimation.calibration import Constants, ModelFit, Reading, cal
 from northfinder.estimation.geometry import by_tilt
 from northfinder.estimation.propagation import Propagation
 from northfinder.record import Record
-from northfinder.record_facts import RecordFacts, facts_of, require_complete
+from northfinder.record.facts import RecordFacts, facts_of, require_complete
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, Problem
 from northfinder.solve_file import kept_assumptions

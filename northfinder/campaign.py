@@ -19,7 +19,7 @@ from northfinder.estimation.campaign import (
     longest_gap,
 )
 from northfinder.record import Record
-from northfinder.record_facts import RecordFacts, facts_of, require_complete
+from northfinder.record.facts import RecordFacts, facts_of, require_complete
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, Problem, solve
 from northfinder.solve_file import kept_assumptions

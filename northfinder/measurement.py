@@ -11,7 +11,7 @@ from drivers.api import Clock, Gyro, RateBlock, Stage
 from northfinder.errors import EstimateError
 from northfinder.estimation import Fix
 from northfinder.record import DwellSpan, Record
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 from northfinder.reduction import Reduction, reduce_record
 from northfinder.sequencer import Plan, Progress, Sequencer
 from northfinder.solution import Assumptions, before_offset, fix_to_json, solve, supplement

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.api import GyroStatus, RateBlock
-from northfinder.block_columns import BlockColumns, columns_of_blocks
 from northfinder.errors import EstimateError
 from northfinder.estimation.means import RateMeans, concatenate, from_samples
 from northfinder.record import DwellSpan, Record
+from northfinder.record.block_columns import BlockColumns, columns_of_blocks
 
 #: Length of the means, in s: short against every drift of a gyro, long against its angle noise.
 MEAN_INTERVAL = 1.0

@@ -21,7 +21,7 @@ from northfinder.cyclogram import Standing, Step, reachable_azimuth
 from northfinder.errors import NorthFinderError, SequenceError
 from northfinder.estimation import Fix
 from northfinder.record import DwellSpan
-from northfinder.recorder import Recorder, parts
+from northfinder.record.recorder import Recorder, parts
 from northfinder.streams import Earlier, StreamPlace
 
 

@@ -16,7 +16,7 @@ from northfinder.estimation.means import RateMeans
 from northfinder.estimation.noise import NoiseModel
 from northfinder.geodesy import Place, bearings_json
 from northfinder.record import Record
-from northfinder.record_facts import completeness, gyro_identity, record_date
+from northfinder.record.facts import completeness, gyro_identity, record_date
 from northfinder.reduction import reduce_record
 from northfinder.solution import Assumptions, fix_to_json, solve, supplement
 from northfinder.tables import DwellTable, StaticTriad, read_table, stated_input_axis_offset

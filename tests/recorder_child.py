@@ -12,7 +12,7 @@ from pathlib import Path
 from recording import block, fill
 
 from northfinder.errors import RecordError
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 
 
 def main(path: Path, n_blocks: int) -> int:

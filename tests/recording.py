@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.api import DeviceIdentity, GyroStatus, RateBlock, StageMode, StageState
 from northfinder.record import DwellSpan
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 
 GYRO = DeviceIdentity(kind="gyro", model="fast3", serial_number="A7", boot_count=3)
 

@@ -12,9 +12,9 @@ from recording import fill, make_record
 from northfinder.cli import main
 from northfinder.errors import RecordError
 from northfinder.record import Record
-from northfinder.record_lock import RecordLock
-from northfinder.record_notes import add_note
-from northfinder.recorder import Recorder
+from northfinder.record.lock import RecordLock
+from northfinder.record.notes import add_note
+from northfinder.record.recorder import Recorder
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:

@@ -18,7 +18,7 @@ from scipy import io
 from northfinder.errors import RecordError
 from northfinder.export import FORMATS, export_record
 from northfinder.record import Record
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 
 Columns = Mapping[str, NDArray[Any]]
 

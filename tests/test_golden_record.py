@@ -12,8 +12,8 @@ import pytest
 
 from drivers.api import GyroStatus, StageMode
 from northfinder.record import Record
-from northfinder.record_check import examine
-from northfinder.record_schema import SCHEMA_VERSION, TABLES
+from northfinder.record.check import examine
+from northfinder.record.schema import SCHEMA_VERSION, TABLES
 from northfinder.solve_file import solve_record
 
 CONTENT = "efb7f85d0bbf0cd4bc71323860b317120ec9021155f77c2815575e8228e8502b"

@@ -17,7 +17,7 @@ from drivers.api import StageMode
 from drivers.discovery import open_stage
 from drivers.transport.clock import SystemClock
 from northfinder.record import Record
-from northfinder.record_check import examine
+from northfinder.record.check import examine
 
 NORTHFINDER = [sys.executable, "-m", "northfinder"]
 FIND = [*NORTHFINDER, *["find", "--speed", "max", "--seed", "1", "--plan", "four-position", "--dwell", "20"]]

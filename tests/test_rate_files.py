@@ -17,7 +17,7 @@ from northfinder.archive import read_arrays
 from northfinder.errors import RecordError
 from northfinder.rate_files import RateSelection, RateSeries, read_rate_file
 from northfinder.record import DwellSpan
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 from northfinder.units import DPH
 
 ANY = RateSelection()

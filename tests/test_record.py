@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from drivers.api import GyroStatus, RateBlock, StageMode, StageState
 from northfinder.errors import RecordError
 from northfinder.record import DwellSpan, Record
-from northfinder.recorder import WRITE_PERIOD, Recorder
+from northfinder.record.recorder import WRITE_PERIOD, Recorder
 
 
 def now() -> float:
@@ -116,7 +116,7 @@ def test_a_killed_recorder_leaves_a_readable_record(tmp_path: Path) -> None:
         "import sys; sys.path.insert(0, sys.argv[2])\n"
         "from pathlib import Path\n"
         "from test_record import block, now\n"
-        "from northfinder.recorder import Recorder\n"
+        "from northfinder.record.recorder import Recorder\n"
         "recorder = Recorder(Path(sys.argv[1]), now)\n"
         "for k in range(50):\n"
         "    recorder.add_block(block(4 * k)); recorder.flush()\n"

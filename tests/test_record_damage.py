@@ -13,11 +13,11 @@ from recording import block, fill, make_record
 
 from northfinder.errors import RecordError
 from northfinder.record import Record
-from northfinder.record_check import examine
-from northfinder.record_pages import rows_of_page, scan
-from northfinder.record_recovery import recover
-from northfinder.record_schema import INSERT, PAGE_SIZE, TABLES, Row, checksum
-from northfinder.recorder import Recorder
+from northfinder.record.check import examine
+from northfinder.record.pages import rows_of_page, scan
+from northfinder.record.recorder import Recorder
+from northfinder.record.recovery import recover
+from northfinder.record.schema import INSERT, PAGE_SIZE, TABLES, Row, checksum
 
 Rows = dict[tuple[str, int], Row]
 SECTOR = 512

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from northfinder.record_schema import SCHEMA_VERSION, TABLES
+from northfinder.record.schema import SCHEMA_VERSION, TABLES
 
 PAGE = (Path(__file__).parents[1] / "docs" / "record.md").read_text()
 

@@ -19,9 +19,9 @@ from recording import block, fill
 
 from northfinder.errors import RecordError
 from northfinder.record import Record
-from northfinder.record_check import examine
-from northfinder.record_writer import STALL_TIMEOUT
-from northfinder.recorder import Recorder, expected_bytes, parts
+from northfinder.record.check import examine
+from northfinder.record.recorder import Recorder, expected_bytes, parts
+from northfinder.record.writer import STALL_TIMEOUT
 
 STRACE = shutil.which("strace")
 traced = pytest.mark.skipif(STRACE is None, reason="needs strace")

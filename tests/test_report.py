@@ -30,7 +30,7 @@ from northfinder.estimation.allan import averaging_factors, overlapping_allan_de
 from northfinder.estimation.means import RateMeans
 from northfinder.geodesy import Place
 from northfinder.measurement import Measurement, measure
-from northfinder.record_schema import INSERT, NAMES, sealed
+from northfinder.record.schema import INSERT, NAMES, sealed
 from northfinder.report.axes import Axis
 from northfinder.report.charts import broken, charts, dwell_pairs, pooled_allan
 from northfinder.report.compass import rose

@@ -19,7 +19,7 @@ from northfinder.errors import ConfigError, RecordError
 from northfinder.estimation import Fix
 from northfinder.measurement import Measurement, Outcome, measure
 from northfinder.record import DwellSpan, Record
-from northfinder.record_check import examine
+from northfinder.record.check import examine
 from northfinder.reduction import Reduction
 from northfinder.resume import remainder_of
 from northfinder.sequencer import Progress, State

@@ -17,7 +17,7 @@ from drivers.transport.virtual import VirtualLink
 from northfinder.cyclogram import Cyclogram, Step, six_position
 from northfinder.errors import ConfigError, RecordError
 from northfinder.record import Record
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 from northfinder.sequencer import TRANSITIONS, Event, Progress, Sequencer, State, StopRequestedError
 
 #: The six positions in ten seconds each.

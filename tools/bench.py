@@ -38,7 +38,7 @@ from drivers.transport.virtual import VirtualClock, VirtualLink
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
 from northfinder.estimation import RateMeans
 from northfinder.record import DwellSpan
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 from northfinder.solution import Assumptions, solve
 from northfinder.units import DPH
 from sim_device.bench import SimBench

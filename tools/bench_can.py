@@ -25,7 +25,7 @@ import can
 from drivers.canopen_gyro import open_gyro
 from drivers.transport.clock import SystemClock
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 
 #: What the project promises; the figures are printed beside them.
 LIMITS = {"can_find_wall_s": 12.0, "can_live_cpu_percent": 40.0, "can_live_single_cpu_percent": 40.0}

@@ -22,7 +22,7 @@ from drivers.protocol import epson, kvh, stim300
 from drivers.protocol.crc_frames import Frames
 from drivers.transport.clock import SystemClock
 from northfinder.cli.emulator import EmulatorProcess, SimulationOptions
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 from sim_device.bench import SimBench
 
 SENT_SECONDS = 200

@@ -20,7 +20,7 @@ import numpy as np
 from drivers.api import DeviceIdentity, RateBlock, StageMode, StageState
 from northfinder.estimation.geometry import sensitivity
 from northfinder.record import DwellSpan
-from northfinder.recorder import Recorder
+from northfinder.record.recorder import Recorder
 from northfinder.solution import Assumptions
 from northfinder.units import ARCSEC, DPH, EARTH_RATE
 

@@ -9,7 +9,7 @@ import click
 
 from northfinder.cli import EXIT_RECORD
 from northfinder.cli.show import print_json
-from northfinder.record_check import Examination, examine
+from northfinder.record.check import Examination, examine
 from northfinder.text import printable
 
 

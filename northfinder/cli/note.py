@@ -8,8 +8,8 @@ from pathlib import Path
 
 import click
 
-from northfinder.record_notes import MAX_NOTE, add_note
-from northfinder.record_summary import newest_record
+from northfinder.record.notes import MAX_NOTE, add_note
+from northfinder.record.summary import newest_record
 from northfinder.text import printable
 
 

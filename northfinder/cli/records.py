@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from northfinder.cli.show import print_json
-from northfinder.record_summary import list_records
+from northfinder.record.summary import list_records
 from northfinder.text import printable
 
 _STYLE = {"complete": "green", "being written": "cyan", "ends early": "yellow", "damaged": "red"}

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from northfinder.cli.show import print_json
-from northfinder.record_recovery import recover
+from northfinder.record.recovery import recover
 from northfinder.text import printable
 
 

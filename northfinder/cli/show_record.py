@@ -14,7 +14,7 @@ from rich.table import Table
 
 from northfinder.cli.records import safe, utc_text, with_sd
 from northfinder.cli.show import print_json
-from northfinder.record_summary import page
+from northfinder.record.summary import page
 
 _MAX_EVENTS = 200
 

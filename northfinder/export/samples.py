@@ -22,9 +22,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from northfinder.block_columns import BlockColumns
 from northfinder.errors import RecordError
 from northfinder.record import DwellSpan, Record
+from northfinder.record.block_columns import BlockColumns
 
 Column = NDArray[np.generic]
 #: Blocks in a batch.

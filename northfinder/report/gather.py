@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.api import DeviceIdentity, GyroStatus
-from northfinder.block_columns import BlockColumns
 from northfinder.errors import EstimateError, RecordError
 from northfinder.estimation import Fix, NoiseModel, RateMeans
 from northfinder.geodesy import Place
 from northfinder.record import DwellSpan, Record
-from northfinder.record_facts import completeness
+from northfinder.record.block_columns import BlockColumns
+from northfinder.record.facts import completeness
 from northfinder.reduction import Reduction
 from northfinder.report.series import Envelope, Series
 from northfinder.solution import Assumptions, Problem, fix_to_json, solve, supplement

@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 
 from drivers.api import DeviceIdentity, RateBlock, StageState
-from northfinder import record_writer
 from northfinder.errors import RecordError
-from northfinder.record import CLOSED, DwellSpan, Record
-from northfinder.record_schema import MAX_BLOCK_BYTES, TABLES, Row, sealed
+from northfinder.record import writer
+from northfinder.record.reader import CLOSED, DwellSpan, Record
+from northfinder.record.schema import MAX_BLOCK_BYTES, TABLES, Row, sealed
 
 #: What has arrived is handed to the file at least this often, in s.
 WRITE_PERIOD = 0.1
@@ -57,8 +57,8 @@ class Recorder:
                 self.n_samples, self.n_lost = record.totals()
                 self._next_row = {table: record.count(table) + 1 for table in TABLES}
                 self.stream = max((info.stream for info in record.streams()), default=-1) + 1
-        opened = record_writer.reopen(path) if resume else record_writer.create(path)
-        self._writer = record_writer.Writer(path, opened)
+        opened = writer.reopen(path) if resume else writer.create(path)
+        self._writer = writer.Writer(path, opened)
         self._writer.start()
 
     def __enter__(self) -> Self:

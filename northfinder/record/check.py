@@ -8,10 +8,10 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from northfinder.record import CLOSED, open_for_reading
-from northfinder.record_lock import is_being_written
-from northfinder.record_recovery import closing_counts
-from northfinder.record_schema import NAMES, TABLES, Row, is_sound
+from northfinder.record.lock import is_being_written
+from northfinder.record.reader import CLOSED, open_for_reading
+from northfinder.record.recovery import closing_counts
+from northfinder.record.schema import NAMES, TABLES, Row, is_sound
 
 #: So many findings of one kind are named one by one.
 _MAX_NAMED = 10

@@ -8,8 +8,8 @@ from typing import Any
 
 from northfinder.errors import RecordError
 from northfinder.record import Record
-from northfinder.record_facts import completeness
-from northfinder.record_lock import is_being_written
+from northfinder.record.facts import completeness
+from northfinder.record.lock import is_being_written
 
 #: A folder with more records than this is listed by its newest ones.
 MAX_LISTED = 10_000

@@ -12,10 +12,10 @@ from pathlib import Path
 import msgspec
 
 from northfinder.errors import RecordError
-from northfinder.record import CLOSED
-from northfinder.record_pages import scan
-from northfinder.record_schema import INSERT, NAMES, SCHEMA, TABLES, sealed
-from northfinder.record_writer import create, finish
+from northfinder.record.pages import scan
+from northfinder.record.reader import CLOSED
+from northfinder.record.schema import INSERT, NAMES, SCHEMA, TABLES, sealed
+from northfinder.record.writer import create, finish
 
 #: Rows written at a time.
 _BATCH = 500

@@ -12,8 +12,8 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from northfinder.errors import RecordError
-from northfinder.record_lock import RecordLock
-from northfinder.record_schema import APPLICATION_ID, INSERT, PAGE_SIZE, SCHEMA, SCHEMA_VERSION, Row
+from northfinder.record.lock import RecordLock
+from northfinder.record.schema import APPLICATION_ID, INSERT, PAGE_SIZE, SCHEMA, SCHEMA_VERSION, Row
 
 #: A disk that has taken nothing for so long ends the measurement, in s.
 STALL_TIMEOUT = 60.0

@@ -1,7 +1,7 @@
 """The record of a measurement: one SQLite file that holds everything that was measured, and what was made of it.
 
 Written in write-ahead mode, so that whatever was committed survives the death of the process; when the record is
-closed, one plain file remains. `record_schema` is its layout, version 1, docs/record.md its description. Times are in
+closed, one plain file remains. `schema` is its layout, version 1, docs/record.md its description. Times are in
 s, angles in rad, rates in rad/s per count. Every row is checked against its seal before anything is made of it.
 """
 
@@ -20,9 +20,9 @@ import msgspec
 import numpy as np
 
 from drivers.api import GyroStatus, RateBlock, RateCounts, StageMode, StageState
-from northfinder.block_columns import BlockColumns
 from northfinder.errors import RecordError
-from northfinder.record_schema import (
+from northfinder.record.block_columns import BlockColumns
+from northfinder.record.schema import (
     APPLICATION_ID,
     MAX_BLOCK_BYTES,
     MAX_ROW_BYTES,

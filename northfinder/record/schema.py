@@ -2,7 +2,7 @@
 
 A row is sealed with the CRC-32C over the name of its table and all its values, number included, in MessagePack. So a
 row that is altered anywhere, or taken for one of another table, is known by itself: SQLite need not vouch for it, and
-`record_pages` finds rows in a file that SQLite cannot open. Numbers run from 1 without a gap, and nothing is ever
+`pages` finds rows in a file that SQLite cannot open. Numbers run from 1 without a gap, and nothing is ever
 changed or deleted; a missing number is a lost row. docs/record.md describes every column.
 """
 

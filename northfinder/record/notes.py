@@ -6,8 +6,8 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from northfinder.record import one_line, open_for_reading
-from northfinder.record_schema import INSERT, sealed
+from northfinder.record.reader import one_line, open_for_reading
+from northfinder.record.schema import INSERT, sealed
 from northfinder.text import printable
 
 #: A note longer than this is a document.

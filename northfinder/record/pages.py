@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from northfinder.errors import RecordError
-from northfinder.record_schema import MAX_ROW_BYTES, PAGE_SIZE, TABLES, Row, is_sound
+from northfinder.record.schema import MAX_ROW_BYTES, PAGE_SIZE, TABLES, Row, is_sound
 
 _WAL_HEADER, _FRAME_HEADER = 32, 24  # bytes
 #: Pages of a log that are remembered for long rows: many times what a recorder lets it grow to.
