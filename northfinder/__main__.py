@@ -1,5 +1,5 @@
 """``python -m northfinder`` is the command line."""
 
-from northfinder.cli import main
+from northfinder.cli import program
 
-main()
+program()

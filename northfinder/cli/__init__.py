@@ -8,9 +8,11 @@ from __future__ import annotations
 import importlib
 import math
 import os
+import signal
 import sys
 import threading
 from contextlib import suppress
+from types import FrameType
 from typing import NoReturn
 
 import click
@@ -99,8 +101,30 @@ def cli() -> None:
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
 
 
+class _Interrupted(BaseException):
+    """A signal to end. No KeyboardInterrupt: click would say so first, to streams that perhaps nobody reads."""
+
+
+def program() -> NoReturn:
+    """Run the process's own command line, until it is done or a signal tells it to end."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  # the signal module's signature
+        raise _Interrupted
+
+    signals = ending_signals()
+    for number in signals:
+        signal.signal(number, interrupt)
+    try:
+        main()
+    except _Interrupted:  # all is in order again; what was still to be said would be said in vain
+        os._exit(EXIT_INTERRUPTED)
+    finally:
+        for number in signals:  # too late for another exit code
+            signal.signal(number, signal.SIG_IGN)
+
+
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line, by default the process's own, and leave with its exit code; every failure is one line."""
+    """Run a command line, by default the process's own, and leave with its exit code; every failure is one line."""
     from drivers.errors import DeviceError  # noqa: PLC0415  # keeps --help quick
     from northfinder.errors import NorthFinderError  # noqa: PLC0415
     from northfinder.text import printable  # noqa: PLC0415
@@ -120,6 +144,15 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         sys.stderr.close()
         code = 1
     _leave(code if isinstance(code, int) else 0)
+
+
+def ending_signals() -> list[signal.Signals]:
+    """Return the signals to end by: a hang-up is none if whoever started the program wants it ignored, as nohup does.
+
+    A shell lets what it starts in the background ignore Ctrl-C, but who presses it wants the stage to stop.
+    """
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN if hasattr(signal, "SIGHUP") else True
+    return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
 
 
 def _display_is_stuck() -> bool:

@@ -12,6 +12,7 @@ from typing import TypeVar
 from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import open_gyro, open_stage
 from drivers.transport.clock import SystemClock
+from northfinder.cli import ending_signals
 from northfinder.config import Config, GyroTable, StageTable, read_config
 from northfinder.errors import ConfigError
 
@@ -60,8 +61,7 @@ def stop_on_signal(clock: SystemClock) -> Iterator[Callable[[], bool]]:
         requested = True
         clock.notify()
 
-    signals = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.signal(number, request) for number in signals}
+    before = {number: signal.signal(number, request) for number in ending_signals()}
     try:
         yield lambda: requested
     finally:
