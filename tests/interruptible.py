@@ -12,15 +12,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from msgspec.structs import replace
 
 from sim_device import server
 from sim_device.bench import SimBench
+from sim_device.can_bench import CanBench
+from sim_device.can_server import BusConnection, open_port
 from sim_device.pace import Pace
-from sim_device.plant.profile import load_profile
+from sim_device.plant.profile import Profile, load_profile
 from sim_device.ports import Connection, PtyPort
+from sim_device.server import LOOPBACK, Served
 
 SIGNALS = {"Ctrl-C": signal.SIGINT, "SIGTERM": signal.SIGTERM, "SIGHUP": signal.SIGHUP}
 #: Signals, a terminal that is closed, and a Ctrl-C while nobody takes what the program says.
@@ -28,19 +31,22 @@ INTERRUPTIONS = (*SIGNALS, "closed terminal", "full pipe")
 PIPE_SIZE = 4096  #: bytes, the smallest pipe there is
 
 
+#: Benches by the devices on them.
+BENCHES = ("native", "native and zaber", "CAN")
+
+
 class LiveBench:
     """An emulated bench with a quick stage near its references, served at real time by a thread of this process."""
 
-    def __init__(self, *, seed: int) -> None:
+    def __init__(self, *, seed: int, devices: str = "native") -> None:
         profile = load_profile("tvg43")
         stage = profile.stage
         near = {name: replace(getattr(stage, name), power_up_deg=8.0) for name in ("azimuth", "elevation")}
         stage = replace(stage, max_speed_deg_per_s=45.0, max_acceleration_deg_per_s2=45.0, **near)
         stage = replace(stage, stop_deceleration_deg_per_s2=450.0)  # at rest within 0.1 s of a command
-        self._bench = SimBench(replace(profile, stage=stage), seed=seed, latitude=math.radians(50.429))
-        self._connections = [Connection(line, line, PtyPort()) for line in (self._bench.gyro, self._bench.stage)]
-        addresses = [f"--{each.line.name}=native:{each.port.address}" for each in self._connections]
-        self.options = addresses  #: that name its devices
+        served = _served(replace(profile, stage=stage), devices, seed=seed, latitude=math.radians(50.429))
+        self._bench, self._connections = served.bench, served.connections
+        self.options = [f"--{name}={address}" for name, address in served.addresses.items()]  #: that name its devices
         self._stop = threading.Event()
         self._thread = threading.Thread(
             target=server._run, args=(Pace(self._bench, 1.0), self._bench, self._connections, self._stop)
@@ -66,6 +72,19 @@ class LiveBench:
     def at_rest_since(self) -> float:
         """Return since when both axes have been at rest, or when they will be, by the clock of `time.monotonic`."""
         return self._begin + 1e-6 * self._bench.plant_stage.rest_since_us()
+
+
+def _served(profile: Profile, devices: str, **world: Any) -> Served:  # noqa: ANN401  # what the emulator's World takes
+    """Return the bench of a profile behind its ports."""
+    if devices == "CAN":
+        can_bench = CanBench(profile, **world)
+        bus = BusConnection(can_bench, open_port(can_bench, "socketcand", LOOPBACK))
+        return Served(can_bench, [bus], bus.addresses)
+    gyro, stage = ("native", "native") if devices == "native" else devices.split(" and ")
+    bench = SimBench(profile, gyro=gyro, stage=stage, **world)
+    lines = [Connection(line, line, PtyPort()) for line in (bench.gyro, bench.stage)]
+    addresses = [f"{kind}:{line.port.address}" for kind, line in zip((gyro, stage), lines, strict=True)]
+    return Served(bench, lines, dict(zip(("gyro", "stage"), addresses, strict=True)))
 
 
 class Host:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from interruptible import INTERRUPTIONS, LiveBench, interruptible
+from interruptible import BENCHES, INTERRUPTIONS, LiveBench, interruptible
 
 from northfinder.errors import RecordError
 from northfinder.record import Record
@@ -102,10 +102,16 @@ def is_complete(path: Path) -> bool:
         return False
 
 
-@pytest.mark.parametrize("how", INTERRUPTIONS)
-def test_interrupted_while_the_stage_moves(tmp_path: Path, how: str) -> None:
+MOVING = [*((how, "native") for how in INTERRUPTIONS), *(("SIGTERM", devices) for devices in BENCHES[1:])]
+
+
+@pytest.mark.parametrize(("how", "devices"), MOVING)
+def test_interrupted_while_the_stage_moves(tmp_path: Path, how: str, devices: str) -> None:
     """Whatever ends the program, the stage is at rest within 0.3 s, the record closed and sound, the exit code 130."""
-    with LiveBench(seed=3) as bench, interruptible(how, [*FIND_ON, *bench.options], tmp_path) as host:
+    with (
+        LiveBench(seed=3, devices=devices) as bench,
+        interruptible(how, [*FIND_ON, *bench.options], tmp_path) as host,
+    ):
         host.go_on_until(bench.stage_moves)
         interrupted = host.interrupt()
         assert host.wait(TIMEOUT) == 130
