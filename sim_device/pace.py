@@ -8,11 +8,15 @@ the host. When the host stays away, time goes on at 1x from there, and a dead ho
 reality: after a quarter of a second with the stage at rest, where a lost frame may be all there is to it; after a
 second while it moves, so that a host which is merely busy finds the same world again. At N times real time what was
 waited for a host is made up for, up to a second of it, so that N is what a whole run has if its host is fast enough.
+
+Time in which the emulator itself got no processor does not pass in the world (`WallTime`): what its hosts said
+meanwhile is with the devices late, and a watchdog would take that for their silence.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from sim_device.bench import Seat, World
 
@@ -22,7 +26,30 @@ MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and 
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
 UNREAD_LOOK_US = 200  #: between looks at whether the host has read what it need not acknowledge
 CATCH_UP_US = 1_000_000  #: of wall time, the most that is made up for
+LONGEST_STEP_US = 100_000  #: of wall time at once; the emulator looks at its lines twice as often if it is let
 CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
+
+
+class WallTime:
+    """Wall time since it was made, in microseconds, less what was lost between two looks at it.
+
+    Parameters
+    ----------
+    monotonic
+        The system's time in s.
+
+    """
+
+    def __init__(self, monotonic: Callable[[], float]) -> None:
+        self._monotonic = monotonic
+        self.origin = self._last = monotonic()  #: the system's time at which it began, or would have if none was lost
+
+    def now_us(self) -> int:
+        """Return it; since the last look at most LONGEST_STEP_US have passed."""
+        now = self._monotonic()
+        self.origin += max(0.0, now - self._last - 1e-6 * LONGEST_STEP_US)
+        self._last = now
+        return round((now - self.origin) * 1e6)
 
 
 class Pace:

@@ -27,7 +27,7 @@ from sim_device.can_server import BUSES, BusConnection, schedule_bus
 from sim_device.can_server import open_port as open_bus_port
 from sim_device.faults import Endpoint, FaultSpec, FaultyLine, LinkFaults, link_faults, schedule
 from sim_device.instruments import GYROS, STAGES
-from sim_device.pace import Pace
+from sim_device.pace import Pace, WallTime
 from sim_device.plant.gyro import ARCSEC
 from sim_device.ports import Connection, Port, PtyPort, TcpPort
 
@@ -103,7 +103,7 @@ def serve(options: ServeOptions, stop: threading.Event | None = None) -> None:
     try:
         with _stopped_by_signals(stop):
             _announce(options, served)
-            _run(pace, served.bench, served.connections, stop)
+            _run(pace, WallTime(time.monotonic), served, stop)
     finally:
         for connection in served.connections:
             connection.port.close()
@@ -130,8 +130,8 @@ def _open_bus(options: ServeOptions) -> Served:
     return Served(bench, [connection], connection.addresses)
 
 
-def _run(pace: Pace, bench: World, connections: Sequence[Connection | BusConnection], stop: threading.Event) -> None:
-    begin = time.monotonic()
+def _run(pace: Pace, wall: WallTime, served: Served, stop: threading.Event) -> None:
+    bench, connections = served.bench, served.connections
     with selectors.DefaultSelector() as selector:
         watched: list[int] = []
         while not stop.is_set():
@@ -140,7 +140,7 @@ def _run(pace: Pace, bench: World, connections: Sequence[Connection | BusConnect
                 _watch(selector, handles)
                 watched = handles
             selector.select(min(LONGEST_WAIT_S, pace.wait_us() * 1e-6))
-            pace.advance(round((time.monotonic() - begin) * 1e6))
+            pace.advance(wall.now_us())
             for connection in connections:
                 connection.take_in(bench.now_us)
             while not _bring_out(connections, bench.now_us) and _run_ahead(pace, connections):

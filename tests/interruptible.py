@@ -20,7 +20,7 @@ from sim_device import server
 from sim_device.bench import SimBench
 from sim_device.can_bench import CanBench
 from sim_device.can_server import BusConnection, open_port
-from sim_device.pace import Pace
+from sim_device.pace import Pace, WallTime
 from sim_device.plant.profile import Profile, load_profile
 from sim_device.ports import Connection, PtyPort
 from sim_device.server import LOOPBACK, Served
@@ -45,16 +45,15 @@ class LiveBench:
         stage = replace(stage, max_speed_deg_per_s=45.0, max_acceleration_deg_per_s2=45.0, **near)
         stage = replace(stage, stop_deceleration_deg_per_s2=450.0)  # at rest within 0.1 s of a command
         served = _served(replace(profile, stage=stage), devices, seed=seed, latitude=math.radians(50.429))
-        self._bench, self._connections = served.bench, served.connections
+        self._served, self._stage = served, served.bench.plant_stage
         self.options = [f"--{name}={address}" for name, address in served.addresses.items()]  #: that name its devices
         self._stop = threading.Event()
-        self._thread = threading.Thread(
-            target=server._run, args=(Pace(self._bench, 1.0), self._bench, self._connections, self._stop)
-        )
 
     def __enter__(self) -> Self:
         """Switch it on."""
-        self._begin = time.monotonic()
+        self._wall = WallTime(time.monotonic)
+        pace = Pace(self._served.bench, 1.0)
+        self._thread = threading.Thread(target=server._run, args=(pace, self._wall, self._served, self._stop))
         self._thread.start()
         return self
 
@@ -62,16 +61,16 @@ class LiveBench:
         """Switch it off."""
         self._stop.set()
         self._thread.join()
-        for connection in self._connections:
+        for connection in self._served.connections:
             connection.port.close()
 
     def stage_moves(self) -> bool:
         """Return whether an axis truly moves."""
-        return self._bench.plant_stage.rest_since_us() > self._bench.now_us
+        return self._stage.rest_since_us() > self._served.bench.now_us
 
     def at_rest_since(self) -> float:
         """Return since when both axes have been at rest, or when they will be, by the clock of `time.monotonic`."""
-        return self._begin + 1e-6 * self._bench.plant_stage.rest_since_us()
+        return self._wall.origin + 1e-6 * self._stage.rest_since_us()
 
 
 def _served(profile: Profile, devices: str, **world: Any) -> Served:  # noqa: ANN401  # what the emulator's World takes

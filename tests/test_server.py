@@ -39,7 +39,7 @@ from raw_host import (
 )
 
 from sim_device.bench import SimBench
-from sim_device.pace import REST_PATIENCE_US, Pace
+from sim_device.pace import REST_PATIENCE_US, Pace, WallTime
 from sim_device.server import main
 
 ROOT = Path(__file__).parents[1]
@@ -285,6 +285,14 @@ def test_wrong_options(options: list[str], message: str, capsys: pytest.CaptureF
     assert said.out == ""
     assert message in said.err
     assert said.err.count("\n") == 1
+
+
+def test_lost_time_does_not_pass() -> None:
+    """An emulator that got no processor for half a second goes on where it was: its hosts were not silent."""
+    instants = iter([5.0, 5.04, 5.05, 5.55, 5.6])
+    wall = WallTime(lambda: next(instants))
+    assert [wall.now_us() for _ in range(4)] == [40_000, 50_000, 150_000, 200_000]
+    assert wall.origin == pytest.approx(5.4)
 
 
 def test_pace_without_hosts() -> None:
