@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 from drivers.api import EXTENDED_IDENTIFIER, FrameLink
 from drivers.canopen.address import parse_node_address
 from drivers.errors import LinkError
-from drivers.transport import can_bus
 from drivers.transport.can_address import BusAddress, parse_bus_address
 from drivers.transport.can_bus import open_bus
 from drivers.transport.can_frames import ERROR, REMOTE, Frame
@@ -213,14 +212,11 @@ def test_bus_off_is_a_named_loss_for_every_link(peer: tuple[can.BusABC, BusAddre
         link.close()
 
 
-def test_a_program_that_does_not_read_is_told_so(
-    peer: tuple[can.BusABC, BusAddress], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_that_does_not_read_is_told_so(peer: tuple[can.BusABC, BusAddress]) -> None:
     """Frames beyond the queue's bound are never dropped in silence: the link is lost, with that sentence."""
-    monkeypatch.setattr(can_bus, "MAX_FRAMES", 10)
     bus, address = peer
     clock = SystemClock()
-    slow, other = open_bus(address, clock), open_bus(address, clock, accept=[0x7FF])
+    slow, other = open_bus(address, clock, max_frames=10), open_bus(address, clock, accept=[0x7FF])
     for _ in range(11):
         bus.send(can.Message(arbitration_id=0x190, is_extended_id=False))
     bus.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))

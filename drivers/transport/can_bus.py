@@ -28,7 +28,12 @@ _registry = threading.Lock()
 
 
 def open_bus(
-    address: BusAddress, clock: Clock, *, accept: Iterable[int] | None = None, baudrate: int = DEFAULT_BAUDRATE
+    address: BusAddress,
+    clock: Clock,
+    *,
+    accept: Iterable[int] | None = None,
+    baudrate: int = DEFAULT_BAUDRATE,
+    max_frames: int = MAX_FRAMES,
 ) -> FrameLink:
     """Open a bus, or another link to one that is open.
 
@@ -42,6 +47,8 @@ def open_bus(
         Identifiers of the frames that the link is to get, None for all.
     baudrate
         Of the serial port of an slcan adapter, bit/s.
+    max_frames
+        How many may wait on the link; it is lost once more have come than the program takes.
 
     Raises
     ------
@@ -54,7 +61,7 @@ def open_bus(
             bus = _buses[address.name] = _Bus(address, _open_port(address, baudrate))
         elif bus.address != address:
             raise LinkError(f"cannot open {address}: this program has it open as {bus.address}")
-        return bus.link(clock, None if accept is None else frozenset(accept))
+        return bus.link(clock, None if accept is None else frozenset(accept), max_frames)
 
 
 def _open_port(address: BusAddress, baudrate: int) -> Port:
@@ -68,10 +75,11 @@ def _open_port(address: BusAddress, baudrate: int) -> Port:
 class CanLink:
     """A `FrameLink` to a shared bus."""
 
-    def __init__(self, bus: _Bus, clock: Clock) -> None:
+    def __init__(self, bus: _Bus, clock: Clock, max_frames: int) -> None:
         self.clock = clock
-        self.frames: deque[Frame] = deque()
-        self.overflowed = False
+        self._frames: deque[Frame] = deque()
+        self._max_frames = max_frames
+        self._overflowed = False
         self._bus = bus
         self._lost = ""
         self._closed = False
@@ -94,7 +102,7 @@ class CanLink:
     def receive(self) -> list[Frame]:
         """Return all data frames that have arrived. Never waits."""
         lost = self._lost or self._bus.lost  # seen before the frames, or the last one could be overlooked
-        frames = self.frames
+        frames = self._frames
         if not frames:
             if lost:
                 self._require_open()
@@ -107,12 +115,15 @@ class CanLink:
             self._closed = True
             self._lost = f"{self.name} is closed"
             self._bus.leave(self)
-            self.frames.clear()
+            self._frames.clear()
 
-    def overflow(self) -> None:
-        """Give up: frames have to be dropped. Called by the reader."""
-        self.overflowed = True
-        self._lost = f"{self.name} has lost frames: {MAX_FRAMES} waited, and the program did not take them"
+    def put(self, frames: list[Frame]) -> None:
+        """Keep frames that have come; the link is lost if too many wait. Called by the reader."""
+        if self._overflowed or len(self._frames) + len(frames) > self._max_frames:
+            self._overflowed = True
+            self._lost = f"{self.name} has lost frames: {self._max_frames} waited, and the program did not take them"
+        else:
+            self._frames.extend(frames)
 
     def _require_open(self) -> None:
         lost = self._lost or self._bus.lost
@@ -134,9 +145,9 @@ class _Bus:
         self._sending = threading.Lock()
         self._reader = threading.Thread(target=self._read_on, name=f"reader of {address}", daemon=True)
 
-    def link(self, clock: Clock, accept: frozenset[int] | None) -> CanLink:
+    def link(self, clock: Clock, accept: frozenset[int] | None, max_frames: int) -> CanLink:
         """Return a new link. Called with the registry locked, as `leave` locks it."""
-        link = CanLink(self, clock)
+        link = CanLink(self, clock, max_frames)
         self._links = (*self._links, (link, accept))
         if not self._reader.is_alive():
             self._reader.start()
@@ -196,13 +207,9 @@ class _Bus:
         self._identifiers.update(identifier for identifier, _ in data if identifier <= STANDARD_MASK)
         for link, accept in self._links:
             wanted = data if accept is None else [frame for frame in data if frame[0] in accept]
-            if not wanted:
-                continue
-            if link.overflowed or len(link.frames) + len(wanted) > MAX_FRAMES:
-                link.overflow()
-            else:
-                link.frames.extend(wanted)
-            link.clock.notify()
+            if wanted:
+                link.put(wanted)
+                link.clock.notify()
 
     def _note(self, identifiers: list[int]) -> None:
         """Count frames that are no data."""
