@@ -1,10 +1,34 @@
-"""Where a stage may be sent: its own limits, narrowed by the host's, and targets held to them."""
+"""Where a stage may be sent: its axes' limits, narrowed by the host's, and targets held to them."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import degrees
 
 from drivers.api import StageLimits
+
+
+@dataclass(frozen=True, slots=True)
+class AxisLimits:
+    """Where an axis may go and how fast, in rad and s."""
+
+    lowest: float
+    highest: float
+    max_speed: float
+    max_acceleration: float
+
+
+def joined(azimuth: AxisLimits, elevation: AxisLimits | None) -> StageLimits:
+    """Return the limits of a stage's axes as its own; without an elevation axis the elevation is 0."""
+    axes = [azimuth] if elevation is None else [azimuth, elevation]
+    return StageLimits(
+        azimuth_min=azimuth.lowest,
+        azimuth_max=azimuth.highest,
+        elevation_min=0.0 if elevation is None else elevation.lowest,
+        elevation_max=0.0 if elevation is None else elevation.highest,
+        max_speed=min(axis.max_speed for axis in axes),
+        max_acceleration=min(axis.max_acceleration for axis in axes),
+    )
 
 
 def narrowed(device: StageLimits, own: StageLimits | None) -> StageLimits:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drivers.api import Clock, DeviceIdentity, SelfTest
 from drivers.canopen.node import SERVICE_PERIOD, Node
 from drivers.errors import DeviceTimeoutError, ProtocolError
-from drivers.protocol.native import SELF_TEST_NAMES
+from drivers.protocol.native import self_test_failures
 
 PROTOCOL = "canopen 1"
 _IDENTITY = 0x1018
@@ -50,6 +50,4 @@ def run_self_test(node: Node, clock: Clock) -> SelfTest:
         pause = clock.now() + SERVICE_PERIOD
         while clock.now() < pause:
             node.wait(pause)
-    failures = node.read(_TEST, 3)
-    bits = [bit for bit in range(16) if failures >> bit & 1]
-    return SelfTest(tuple(SELF_TEST_NAMES[bit] if bit < len(SELF_TEST_NAMES) else f"bit {bit}" for bit in bits))
+    return SelfTest(self_test_failures(node.read(_TEST, 3)))

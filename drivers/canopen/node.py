@@ -20,6 +20,7 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from drivers.api import Clock, FrameLink
 from drivers.canopen.network import SDO_TIMEOUT, LinkNetwork, LinkNode, SilenceError
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
+from drivers.protocol.text import unpadded
 
 EDS_FOLDER = Path(__file__).parent.parent / "eds"
 HEARTBEAT_MS = 100  #: of a node, as the drivers ask for it
@@ -229,7 +230,7 @@ class Node:
         """Return a text up to its padding, printable: what else there is becomes ``?``. Raises as `read`."""
         variable = self._variable(index, 0)
         data = self._transfer(f"reading {_called(variable)}", lambda: self.remote.sdo.upload(index, 0))
-        return "".join(chr(code) if 0x20 <= code < 0x7F else "?" for code in data.split(b"\0")[0])
+        return unpadded(data)
 
     def write(self, index: int, subindex: int, value: int, *, verify: bool = False) -> None:
         """Write a number, and read it back if asked to. Raises as `read`; ProtocolError if it reads back otherwise."""

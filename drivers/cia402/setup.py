@@ -13,6 +13,7 @@ from drivers.cia402.axis import AXIS_NAMES, Axis, Wait
 from drivers.cia402.options import DriveOptions
 from drivers.cia402.words import FAULTY, Control, DriveState
 from drivers.errors import DeviceFaultError, ProtocolError
+from drivers.limits import AxisLimits
 
 HOST_NODE = 127
 STATUS_PERIOD_MS = 100  # of a drive in motion
@@ -122,8 +123,8 @@ def map_pdos(axis: Axis) -> None:
         _save(node, pdo, None if axis.ours else STATUS_PERIOD_MS)  # ours have a status period of their own
 
 
-def limits_of(axis: Axis, own: StageLimits | None) -> tuple[float, float, float, float]:
-    """Return lowest and highest position in rad, greatest speed in rad/s and acceleration in rad/s^2.
+def limits_of(axis: Axis, own: StageLimits | None) -> AxisLimits:
+    """Return where a drive may go and how fast.
 
     The soft limits 607D are narrowed to `own` first, never widened.
 
@@ -143,7 +144,7 @@ def limits_of(axis: Axis, own: StageLimits | None) -> tuple[float, float, float,
     speed_units = node.read_optional(0x607F) or node.read(0x6081)
     acceleration_units = min(node.read(0x6083), node.read_optional(0x6084) or node.read(0x6083))
     speed = speed_units / axis.speed_units
-    return (
+    return AxisLimits(
         lowest,
         highest,
         speed if own is None else min(speed, own.max_speed),

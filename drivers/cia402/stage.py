@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
-from math import degrees
 
 from drivers.api import Clock, DeviceIdentity, FrameLink, SelfTest, StageLimits, StageMode, StageState
 from drivers.canopen.identity import run_self_test
@@ -14,6 +14,7 @@ from drivers.cia402.axis import AXIS_NAMES, Activity, Axis
 from drivers.cia402.options import DriveOptions
 from drivers.cia402.words import HOMING, PROFILE_POSITION, Control, DriveState
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError
+from drivers.limits import joined, require_within
 
 IDENTIFIERS = (0x080, 0x180, 0x280, 0x580, 0x700)  #: to which each node's number is added
 HEARTBEAT_PERIOD = 0.05  # s of host time; half of what the drives are promised, so that a late call does no harm
@@ -107,7 +108,7 @@ class Cia402Stage:
             setup.configure(axis)
             setup.map_pdos(axis)
             axis.see_homed(self._waiter(axis))
-        self._limits = self._read_limits()
+        self._limits = joined(*(setup.limits_of(axis, self._own_limits) for axis in self._axes))
         self._connected = True
         for axis in self._axes:
             axis.node.order("OPERATIONAL")
@@ -155,9 +156,10 @@ class Cia402Stage:
         """
         limits = self.limits
         speed = limits.max_speed if speed is None else speed
-        self._require("azimuth", azimuth, limits.azimuth_min, limits.azimuth_max, "deg")
-        self._require("elevation", elevation, limits.elevation_min, limits.elevation_max, "deg")
-        self._require("speed", speed, 1 / self._axes[0].speed_units, limits.max_speed, "deg/s")
+        slowest, half = 1 / self._axes[0].speed_units, 0.5 / min(abs(axis.units) for axis in self._axes)
+        require_within("azimuth", azimuth, limits.azimuth_min, limits.azimuth_max, unit="deg", slack=half)
+        require_within("elevation", elevation, limits.elevation_min, limits.elevation_max, unit="deg", slack=half)
+        require_within("speed", speed, slowest, limits.max_speed, unit="deg/s", slack=half)
         self._require_rest("a move")
         for axis in self._axes:
             if not axis.homed:
@@ -245,26 +247,7 @@ class Cia402Stage:
     def _identity(self, identities: list[DeviceIdentity]) -> DeviceIdentity:
         """Return two drives as one device."""
         first, second = identities
-        numbers = dict.fromkeys((first.serial_number, second.serial_number))
-        return DeviceIdentity(
-            kind="stage",
-            model=first.model,
-            serial_number=", ".join(numbers),
-            firmware_version=first.firmware_version,
-            protocol=first.protocol,
-            boot_count=first.boot_count,
-        )
-
-    def _read_limits(self) -> StageLimits:
-        azimuth, elevation = (setup.limits_of(axis, self._own_limits) for axis in self._axes)
-        return StageLimits(
-            azimuth_min=azimuth[0],
-            azimuth_max=azimuth[1],
-            elevation_min=elevation[0],
-            elevation_max=elevation[1],
-            max_speed=min(azimuth[2], elevation[2]),
-            max_acceleration=min(azimuth[3], elevation[3]),
-        )
+        return replace(first, serial_number=", ".join(dict.fromkeys((first.serial_number, second.serial_number))))
 
     def _newest(self) -> StageState:
         """Return the state by what the axes have told."""
@@ -339,15 +322,6 @@ class Cia402Stage:
                 raise DeviceFaultError(f"{axis.name} refuses {what}: the fault {axis.fault} must be cleared first")
             if axis.activity is not Activity.REST:
                 raise DeviceFaultError(f"{axis.name} refuses {what}: it must be at rest first")
-
-    def _require(self, name: str, value: float, least: float, most: float, unit: str) -> None:
-        """Raise ValueError unless `value` lies between `least` and `most`, to half a unit of the drive."""
-        half = 0.5 / min(abs(axis.units) for axis in self._axes)
-        if not least - half <= value <= most + half:
-            raise ValueError(
-                f"{name} {degrees(value):.4f} {unit} lies outside the stage's limits, "
-                f"{degrees(least):.4f} to {degrees(most):.4f} {unit}"
-            )
 
     # Waiting, and the heartbeat that goes on meanwhile
 

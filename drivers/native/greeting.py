@@ -7,6 +7,7 @@ from construct import Container
 from drivers.api import DeviceIdentity
 from drivers.errors import DeviceError, DeviceTimeoutError, ProtocolError
 from drivers.protocol.native import DEFINITION_HASH, PROTOCOL_VERSION, DeviceKind, MessageType, build
+from drivers.protocol.text import unpadded
 
 KIND_NAMES = {DeviceKind.GYRO: "gyro", DeviceKind.STAGE: "stage"}
 _KIND_TITLES = {DeviceKind.GYRO: "a gyro", DeviceKind.STAGE: "a rotation stage"}
@@ -54,9 +55,9 @@ def identity(answer: Container, port: str, expected: DeviceKind | None) -> Devic
         raise ProtocolError(f"{name} refused to open a session")
     return DeviceIdentity(
         kind=KIND_NAMES[kind],
-        model=printable(answer.model),
-        serial_number=printable(answer.serial_number),
-        firmware_version=printable(answer.firmware_version),
+        model=unpadded(answer.model),
+        serial_number=unpadded(answer.serial_number),
+        firmware_version=unpadded(answer.firmware_version),
         protocol=f"native {answer.protocol_version}",
         boot_count=answer.boot_count,
     )
@@ -69,12 +70,3 @@ def no_answer(port: str, n_bytes: int, n_frames: int) -> DeviceError:
     if n_bytes:
         return ProtocolError(f"{port}: {n_bytes} bytes came but no valid frame: wrong baud rate or another device?")
     return DeviceTimeoutError(f"nothing answered on {port}: is the device powered, and is this its port?")
-
-
-def printable(text: bytes) -> str:
-    r"""Return a device's text up to its padding, with whatever is not printable ASCII replaced by ``?``.
-
-    >>> printable(b"tvg43\x1b[2J\0\0\0")
-    'tvg43?[2J'
-    """
-    return "".join(chr(code) if 0x20 <= code < 0x7F else "?" for code in text.split(b"\0")[0])

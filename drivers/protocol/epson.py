@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
 from drivers.protocol.layout import numpy_dtype
+from drivers.protocol.text import printable
 
 HEADER = b"\x80"
 DELIMITER = 0x0D
@@ -161,7 +162,7 @@ def text_of(words: list[int]) -> str:
     'G370PDS0'
     """
     data = b"".join(word.to_bytes(2, "little") for word in words)
-    return "".join(chr(code) if 0x20 <= code < 0x7F else "?" for code in data.rstrip(b"\0")).strip()
+    return printable(data.rstrip(b"\0")).strip()
 
 
 def filter_code(sample_rate: float) -> int:

@@ -275,6 +275,16 @@ def build(kind: MessageType, **fields: int | bytes | list[list[int]]) -> bytes:
     return body
 
 
+def self_test_failures(bits: int) -> tuple[str, ...]:
+    """Return the names of the bits that are set in the result of a self-test.
+
+    >>> self_test_failures(0x8020)
+    ('encoder', 'bit 15')
+    """
+    names = dict(enumerate(SELF_TEST_NAMES))
+    return tuple(names.get(bit, f"bit {bit}") for bit in range(16) if bits >> bit & 1)
+
+
 def decode_samples(bodies: Sequence[bytes]) -> list[NDArray[np.void]]:
     """Return the SAMPLES bodies as arrays of records, one array for each run of bodies of equal form.
 

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from drivers.errors import ProtocolError
 from drivers.protocol.crc_frames import CRC_SIZE, CrcFrameDecoder, Frames
 from drivers.protocol.layout import integers24, numpy_dtype
+from drivers.protocol.text import printable
 
 TERMINATOR = b"\r\n"
 COUNTER_RATE = 2000  #: Hz, what `counter` counts
@@ -283,11 +284,6 @@ def parse_extended_error(body: bytes) -> tuple[str, ...]:
     """Return what is wrong by the 128 bits of the extended error information, in words where they are known."""
     value = int.from_bytes(LAYOUTS[body[0]].parse(body).bits, "big")
     return tuple(_ERRORS.get(bit, f"error bit {bit}") for bit in range(128) if value >> bit & 1)
-
-
-def printable(raw: bytes) -> str:
-    """Return bytes of a device as text that is safe to show."""
-    return "".join(chr(byte) if 0x20 <= byte < 0x7F else "?" for byte in raw)
 
 
 START_UP_ERROR = "start-up under way"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from math import degrees, radians
 
 from drivers.errors import ProtocolError
+from drivers.limits import AxisLimits
 from drivers.protocol.zaber import (
     ACCELERATION_UNITS,
     DOUBTFUL,
@@ -19,16 +20,6 @@ from drivers.zaber.line import Line, Target
 from drivers.zaber.options import KNOWN_UNITS_PER_DEG, AxisOptions
 
 TOLERANCE = radians(0.005)  #: of a position reached, and of one that rests; or 2 microsteps if those are more
-
-
-@dataclass(frozen=True, slots=True)
-class AxisLimits:
-    """Where an axis may go and how fast, in rad and s."""
-
-    lowest: float
-    highest: float
-    max_speed: float
-    max_acceleration: float
 
 
 @dataclass(frozen=True, slots=True)

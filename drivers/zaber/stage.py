@@ -13,9 +13,9 @@ from math import inf
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, SelfTest, StageLimits, StageMode, StageState
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
-from drivers.limits import narrowed, require_within
+from drivers.limits import joined, narrowed, require_within
 from drivers.protocol.zaber import NOT_HOMED, LineCounts, integers
-from drivers.zaber.axis import AxisLimits, AxisReport, ZaberAxis, describe
+from drivers.zaber.axis import AxisReport, ZaberAxis, describe
 from drivers.zaber.line import Line, Target
 from drivers.zaber.options import AxisOptions
 
@@ -108,7 +108,7 @@ class ZaberStage:
         for axis in self._axes:
             identity = identities[axis.target.device]
             found.append(axis.meet(_device_id(identity), _firmware(identity.firmware_version)))
-        self._limits = narrowed(_joined(found), self._own_limits)
+        self._limits = narrowed(joined(found[0], found[1] if len(found) > 1 else None), self._own_limits)
         self._order_all("stop")
         self._read_flags()
         self._await_rest()
@@ -446,16 +446,3 @@ def _firmware(version: str) -> tuple[int, int]:
     if found is None:
         raise ProtocolError(f"a device's firmware is {version!r}, expected a version such as 7.35")
     return int(found[1]), int(found[2])
-
-
-def _joined(axes: list[AxisLimits]) -> StageLimits:
-    """Return the limits of one or two axes as a stage's; without an elevation axis the elevation is 0."""
-    lowest, highest = (axes[1].lowest, axes[1].highest) if len(axes) > 1 else (0.0, 0.0)
-    return StageLimits(
-        azimuth_min=axes[0].lowest,
-        azimuth_max=axes[0].highest,
-        elevation_min=lowest,
-        elevation_max=highest,
-        max_speed=min(axis.max_speed for axis in axes),
-        max_acceleration=min(axis.max_acceleration for axis in axes),
-    )
