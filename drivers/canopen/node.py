@@ -11,14 +11,17 @@ from pathlib import Path
 from typing import TypeVar
 
 import canopen
+import numpy as np
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import ODVariable
 from canopen.objectdictionary.datatypes import SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
+from numpy.typing import NDArray
 
 from drivers.api import Clock, FrameLink
 from drivers.canopen.network import SDO_TIMEOUT, LinkNetwork, LinkNode, SilenceError
+from drivers.canopen.pdo import PdoCodec
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
 from drivers.protocol.text import unpadded
 
@@ -134,6 +137,18 @@ class Node:
         waiting = self._pdos[cob_id]
         self._pdos[cob_id] = []
         return waiting
+
+    def take_values(self, codec: PdoCodec) -> dict[tuple[int, int], NDArray[np.int64]]:
+        """Return each object's values in the frames of a PDO that have come, oldest first; ``{}`` if none have.
+
+        Frames of another length than the PDO's are counted in `n_malformed`.
+        """
+        frames = self.take(codec.cob_id)
+        if not frames:
+            return {}
+        values, n_malformed = codec.decode(frames)
+        self.n_malformed += n_malformed
+        return values
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send a frame."""

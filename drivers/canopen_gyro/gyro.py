@@ -129,7 +129,8 @@ class CanopenGyro:
         if not self._connected:
             raise LinkError(f"{self._node.name} cannot start: connect first")
         self._node.service()
-        self._frames()  # of a stream before
+        for codec in self._axis_codecs:
+            self._node.take(codec.cob_id)  # of a stream before
         self._assembler = SampleAssembler(self._n_axes, self._sample_rate, self._block_samples)
         self._n_acknowledged = 0
         self._node.write(_STREAM, 0, 1)
@@ -199,19 +200,13 @@ class CanopenGyro:
         self._block_samples = burst if 2 * burst > usual else max(1, usual)
         node.write(_SLOW_PERIOD, 0, max(100, round(1000 * self._block_samples / self._sample_rate)), verify=True)
 
-    def _frames(self) -> list[list[bytes]]:
-        """Return what has come of each PDO of samples."""
-        return [self._node.take(codec.cob_id) for codec in self._axis_codecs]
-
     def _take_in(self) -> None:
         """Take in the PDOs that have come. Raises DeviceFaultError if one gyro cannot have sent them."""
         node = self._node
-        arrived = zip(self._axis_codecs, self._frames(), (1, 2, 3), strict=True)
-        for codec, frames, axis in list(arrived)[: self._n_axes]:
-            if not frames:
+        arrived = [node.take_values(codec) for codec in self._axis_codecs]
+        for axis, values in enumerate(arrived[: self._n_axes], 1):
+            if not values:
                 continue
-            values, n_malformed = codec.decode(frames)
-            node.n_malformed += n_malformed
             self._heard_at = self._clock.now()
             try:
                 self._assembler.add(axis - 1, values[_NUMBER], values[_RATE, axis], values[_STATUS])
@@ -245,9 +240,5 @@ class CanopenGyro:
 
 def _rows(node: Node, codec: PdoCodec, *keys: tuple[int, int]) -> list[tuple[int, ...]]:
     """Return the values of a PDO's objects in each frame that has come."""
-    frames = node.take(codec.cob_id)
-    if not frames:
-        return []
-    values, n_malformed = codec.decode(frames)
-    node.n_malformed += n_malformed
-    return list(zip(*(values[key].tolist() for key in keys), strict=True))
+    values = node.take_values(codec)
+    return list(zip(*(values[key].tolist() for key in keys), strict=True)) if values else []

@@ -126,18 +126,13 @@ class Axis:
         """
         self.node.service()
         heard = self._take_emergencies()
-        times = self.node.take(self._time_codec.cob_id)
-        frames = self.node.take(self._status_codec.cob_id)
-        if times:
-            values, n_malformed = self._time_codec.decode(times)
-            self.node.n_malformed += n_malformed
-            if len(values[_VELOCITY]):
-                self.velocity = int(values[_VELOCITY][-1])
-                self.device_time_ms = int(values[_DEVICE_TIME][-1]) if _DEVICE_TIME in values else None
-        if frames:
-            values, n_malformed = self._status_codec.decode(frames)
-            self.node.n_malformed += n_malformed
-            for statusword, position in zip(values[_STATUS].tolist(), values[_POSITION].tolist(), strict=True):
+        times = self.node.take_values(self._time_codec)
+        statuses = self.node.take_values(self._status_codec)
+        if times and len(times[_VELOCITY]):
+            self.velocity = int(times[_VELOCITY][-1])
+            self.device_time_ms = int(times[_DEVICE_TIME][-1]) if _DEVICE_TIME in times else None
+        if statuses:
+            for statusword, position in zip(statuses[_STATUS].tolist(), statuses[_POSITION].tolist(), strict=True):
                 self.statusword, self.position = statusword, position
                 self.advance()
                 heard = True
