@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, TypeVar
 
-from drivers.api import ByteLink, Clock, RateBlock
-from drivers.errors import DeviceError, DeviceTimeoutError, LinkError, ProtocolError
+from drivers.api import ByteLink, Clock
+from drivers.errors import DeviceTimeoutError, LinkError, ProtocolError
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
 
-BATCH_TIME = 0.2  # s of samples that are decoded together
-LONGEST_BLOCK = 0.25  # s
-MAX_SILENCE = 1.0  # s, or three samples if that is longer
 _DRAIN_TIME = 0.06  # s, more than a reader of a port that was full takes to read on
 _DRAIN_SLACK = 256  # bytes
 _MAX_DRAINS = 20
 _LONGEST_SIGN = 15  # bytes, less one
 _LONGEST_HOLD = 0.25  # s for which bytes wait for more of them
+_MAX_HEARD = 4096  # bytes that are searched for an answer
+T = TypeVar("T")
 
 
 class FrameDecoder(Protocol):
@@ -113,6 +112,19 @@ class FrameStream:
         self._tail = b""
         return data
 
+    def hear(self, find: Callable[[bytes], T | None], *, patience: float, heard: bytes = b"") -> tuple[bytes, T | None]:
+        """Take bytes as they are until `find` finds something in them, at most for `patience` s.
+
+        Return the newest of those heard, after what was heard before, and what was found, None if nothing.
+        """
+        deadline = self._clock.now() + patience
+        while True:
+            heard = heard[-_MAX_HEARD:] + self.take_raw()
+            found = find(heard)
+            if found is not None or self._clock.now() >= deadline:
+                return heard, found
+            self._clock.wait(deadline)
+
     def drain(self, *, bytes_per_second: float) -> None:
         """Throw away what has come, until no more comes than is being sent: what waited in buffers is gone then."""
         for _ in range(_MAX_DRAINS):
@@ -187,78 +199,3 @@ class FrameStream:
             f"{name} is silent: no {self._what} has answered {asked!r}. Look at its supply and its wires, "
             "and switch it off and on if it was left in a service mode"
         )
-
-
-#: Turns frames that have come by an instant into blocks; what is wrong with them comes beside those before it.
-Assemble = Callable[[list[Frames], float], tuple[list[RateBlock], DeviceError | None]]
-
-
-class SampleReader:
-    """`drivers.api.Gyro.read` of an instrument that sends by itself, between `begin` and `end`.
-
-    Parameters
-    ----------
-    stream
-        Of its frames.
-    clock
-        That of the stream's link.
-    """
-
-    def __init__(self, stream: FrameStream, clock: Clock) -> None:
-        self._stream = stream
-        self._clock = clock
-        self._assemble: Assemble | None = None
-        self._batch = 0
-        self._max_silence = MAX_SILENCE
-        self._waiting: list[Frames] = []
-        self._ended = False
-        self._heard_at = 0.0
-        self._failure: DeviceError | None = None
-
-    @property
-    def under_way(self) -> bool:
-        """Whether samples are read."""
-        return self._assemble is not None and not self._ended
-
-    def begin(self, assemble: Assemble, *, sample_rate: float, frame_size: int, waiting: list[Frames]) -> None:
-        """Read samples from now on; `waiting` have come already."""
-        self._assemble, self._waiting = assemble, waiting
-        self._batch = max(1, round(BATCH_TIME * sample_rate)) * frame_size
-        self._max_silence = max(MAX_SILENCE, 3 / sample_rate)
-        self._ended, self._failure = False, None
-        self._heard_at = self._clock.now()
-        self._stream.damaged()
-
-    def end(self) -> None:
-        """Take no more; what was sent before can still be read."""
-        self._ended = True
-
-    def reset(self) -> None:
-        """Forget the stream."""
-        self._assemble = self._failure = None
-
-    def read(self) -> list[RateBlock]:
-        """Return the blocks that have come; the rest is as `drivers.api.Gyro.read` says."""
-        if self._failure is not None:
-            raise self._failure
-        if self._assemble is None:
-            self._stream.take_raw()
-            return []
-        frames, self._waiting = self._waiting, []
-        frames += self._stream.take(0 if self._ended else self._batch)
-        now = self._clock.now()
-        blocks: list[RateBlock] = []
-        if frames:
-            blocks, self._failure = self._assemble(frames, now)
-        if blocks:
-            self._heard_at = now
-        elif self._failure is not None:
-            raise self._failure
-        elif not self._ended and now - self._heard_at > self._max_silence and not self._stream.holds:
-            raise DeviceTimeoutError(
-                f"{self._stream.link.name} has sent no samples for {now - self._heard_at:.1f} s: "
-                "was it switched off or unplugged?"
-            )
-        if self._ended:
-            self._assemble = None
-        return blocks

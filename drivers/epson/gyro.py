@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
 from drivers.epson.settings import Registers, Unit
 from drivers.errors import DeviceError, ProtocolError
-from drivers.frame_stream import LONGEST_BLOCK, FrameStream, SampleReader
+from drivers.frame_stream import FrameStream
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
-from drivers.protocol.epson import BURST_SIZE, ERROR, BurstDecoder, CounterCheck, records
-from drivers.protocol.sample_index import Part, SampleIndex, parts
+from drivers.protocol.epson import BURST_SIZE, ERROR, BurstDecoder, CounterCheck, Model, records
+from drivers.sample_reader import SampleFormat, SampleReader, Samples, Vector
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 COUNTER_SPAN = 65_536
@@ -42,7 +44,6 @@ class EpsonGyro:
         self._unit: Unit | None = None
         self._stream: FrameStream | None = None
         self._reader: SampleReader | None = None
-        self._index = SampleIndex(span=COUNTER_SPAN, step=1, sample_rate=sample_rate)
         self._counter = CounterCheck()
 
     @property
@@ -99,13 +100,20 @@ class EpsonGyro:
 
     def start(self) -> None:
         """Enter sampling mode; samples are counted from the first that comes."""
-        reader = self._connected()[1]
+        unit, reader = self._connected()
         if reader.under_way:
             return
         self._registers.enter_configuration()
-        self._index = SampleIndex(span=COUNTER_SPAN, step=1, sample_rate=self._sample_rate)
         self._counter = CounterCheck()
-        reader.begin(self._blocks, sample_rate=self._sample_rate, frame_size=BURST_SIZE[32], waiting=[])
+        form = SampleFormat(
+            decode=self._decode,
+            beside=partial(_beside, unit.model),
+            frame_size=BURST_SIZE[32],
+            sample_rate=self._sample_rate,
+            rate_lsb=unit.model.rate_lsb,
+            span=COUNTER_SPAN,
+        )
+        reader.begin(form)
         self._registers.start_sampling()
 
     def read(self) -> list[RateBlock]:
@@ -144,38 +152,20 @@ class EpsonGyro:
             raise ProtocolError(f"{self._link.name} has not been connected")
         return self._unit, self._reader
 
-    def _blocks(self, frames: list[Frames], now: float) -> tuple[list[RateBlock], DeviceError | None]:
-        """Return bursts as blocks."""
+    def _decode(self, frames: list[Frames]) -> tuple[Samples | None, DeviceError | None]:
+        """Return the samples in bursts."""
         bursts = self._counter.confirm(records(frames))
-        if not len(bursts) or self._stream is None:
-            return [], None
-        expected = self._index.next_index
-        numbered = self._index.number(bursts["counter"], now, damaged=self._stream.damaged())
+        if not len(bursts):
+            return None, None
         counts = bursts["rate"][:, self._axes].astype(np.int32)
-        status = _status(bursts, counts)
-        longest = max(1, round(LONGEST_BLOCK * self._sample_rate))
-        return [
-            self._block(bursts[part.where], counts[part.where], part, status=int(status[part.where.start]), now=now)
-            for part in parts(numbered, status, expected=expected, longest=longest)
-        ], None
+        return Samples(bursts, bursts["counter"], counts, _status(bursts, counts)), None
 
-    def _block(
-        self, bursts: NDArray[np.void], counts: NDArray[np.int32], part: Part, *, status: int, now: float
-    ) -> RateBlock:
-        model = self._connected()[0].model
-        mean = bursts["acceleration"].astype(np.float64).mean(axis=0) * (model.acceleration_lsb * STANDARD_GRAVITY)
-        x, y, z = mean.tolist()
-        return RateBlock(
-            first_index=part.first,
-            device_time=part.first / self._sample_rate,
-            arrival_time=now,
-            counts=counts,
-            rate_lsb=model.rate_lsb,
-            temperature=model.celsius(float(bursts["temperature"].mean())),
-            specific_force=(x, y, z),
-            status=GyroStatus(status) | (GyroStatus.OVERRUN if part.unsure else GyroStatus.OK),
-            n_lost=part.n_lost,
-        )
+
+def _beside(model: Model, bursts: NDArray[np.void]) -> tuple[float, Vector]:
+    """Return temperature and specific force."""
+    mean = bursts["acceleration"].astype(np.float64).mean(axis=0) * (model.acceleration_lsb * STANDARD_GRAVITY)
+    x, y, z = mean.tolist()
+    return model.celsius(float(bursts["temperature"].mean())), (x, y, z)
 
 
 def _status(bursts: NDArray[np.void], counts: NDArray[np.int32]) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
-from drivers.frame_stream import LONGEST_BLOCK, FrameStream, SampleReader
+from drivers.frame_stream import FrameStream
 from drivers.kvh.settings import Found, configure
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
 from drivers.protocol.kvh import (
@@ -20,7 +20,7 @@ from drivers.protocol.kvh import (
     find_test,
     wire_size,
 )
-from drivers.protocol.sample_index import Part, SampleIndex, parts
+from drivers.sample_reader import SampleFormat, SampleReader, Samples, Vector
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 _LOOK_TIME = 3.0  # s in which some axis has to become valid
@@ -57,7 +57,6 @@ class KvhGyro:
         self._may_set = may_set
         self._found: Found | None = None
         self._axes: list[int] = []
-        self._index = SampleIndex(span=SEQUENCE_SPAN, step=1, sample_rate=1.0)
 
     @property
     def sample_rate(self) -> float:
@@ -94,7 +93,7 @@ class KvhGyro:
             If it is not set to what is asked for, or has other axes.
         """
         self._reader.reset()
-        self._found = configure(self._stream, self._clock, data_rate=self._data_rate, may_set=self._may_set)
+        self._found = configure(self._stream, data_rate=self._data_rate, may_set=self._may_set)
         valid, n_accelerometers = self._look()
         self._axes = self._choose(valid)
         kind = "1750 or 1775" if n_accelerometers else "DSP-1750 or DSP-1760"
@@ -108,14 +107,9 @@ class KvhGyro:
     def self_test(self) -> SelfTest:
         """Ask for the built-in test; of a unit that has none, look at what its messages say of themselves."""
         self._stream.link.write(b"?BIT\r\n")
-        deadline = self._clock.now() + _TEST_TIME
-        heard = b""
-        while self._clock.now() < deadline:
-            heard += self._stream.take_raw()
-            failures = find_test(heard)
-            if failures is not None:
-                return SelfTest(failures)
-            self._clock.wait(deadline)
+        _, failures = self._stream.hear(find_test, patience=_TEST_TIME)
+        if failures is not None:
+            return SelfTest(failures)
         valid, _ = self._look()
         return SelfTest(tuple(f"gyro {'xyz'[axis]} is not valid" for axis in self._axes if axis not in valid))
 
@@ -123,11 +117,18 @@ class KvhGyro:
         """Begin to count samples at 0, with the first that comes from now on."""
         if self._reader.under_way:
             return
-        rate, size = self.found.units.data_rate, wire_size(self.found.form)
-        self._stream.drain(bytes_per_second=rate * size)
-        self._index = SampleIndex(span=SEQUENCE_SPAN, step=1, sample_rate=rate)
+        units, size = self.found.units, wire_size(self.found.form)
+        self._stream.drain(bytes_per_second=units.data_rate * size)
         self._n_tests = self._stream.n_signs
-        self._reader.begin(self._blocks, sample_rate=rate, frame_size=size, waiting=[])
+        form = SampleFormat(
+            decode=self._decode,
+            beside=self._beside,
+            frame_size=size,
+            sample_rate=units.data_rate,
+            rate_lsb=units.rate_lsb,
+            span=SEQUENCE_SPAN,
+        )
+        self._reader.begin(form)
 
     def read(self) -> list[RateBlock]:
         """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.
@@ -179,8 +180,8 @@ class KvhGyro:
             raise DeviceFaultError(f"{self._stream.link.name} has gyros {names}: say which one with axis = 'x'")
         return valid
 
-    def _blocks(self, frames: list[Frames], now: float) -> tuple[list[RateBlock], DeviceError | None]:
-        """Return messages as blocks, up to what is wrong."""
+    def _decode(self, frames: list[Frames]) -> tuple[Samples | None, DeviceError | None]:
+        """Return the samples in messages, up to what is wrong."""
         form = self.found.form
         runs = [decode_messages(run) for run in frames if FORMATS[run.header] == form]
         failure: DeviceError | None = None
@@ -191,17 +192,11 @@ class KvhGyro:
         if self._stream.n_signs > self._n_tests:
             failure = DeviceFaultError(f"{self._stream.link.name} was reset: it tells how its power-on test went")
         if not runs:
-            return [], failure
+            return None, failure
         messages = np.concatenate(runs) if len(runs) > 1 else runs[0]
-        expected = self._index.next_index
-        numbered = self._index.number(messages["sequence"] % SEQUENCE_SPAN, now, damaged=self._stream.damaged())
         counts = messages["rotation"][:, self._axes].astype(np.float32)
         status = self._status(messages, counts)
-        longest = max(1, round(LONGEST_BLOCK * self.sample_rate))
-        return [
-            self._block(messages[part.where], counts[part.where], part, status=int(status[part.where.start]), now=now)
-            for part in parts(numbered, status, expected=expected, longest=longest)
-        ], failure
+        return Samples(messages, messages["sequence"] % SEQUENCE_SPAN, counts, status), failure
 
     def _status(self, messages: NDArray[np.void], counts: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the status of each message; numbers that are none become 0, in place."""
@@ -211,28 +206,16 @@ class KvhGyro:
         counts[~finite] = 0.0
         return np.where(wrong | ~finite, GyroStatus.SENSOR_FAULT, GyroStatus.OK).astype(np.uint8)
 
-    def _block(
-        self, messages: NDArray[np.void], counts: NDArray[np.float32], part: Part, *, status: int, now: float
-    ) -> RateBlock:
-        units = self.found.units
-        return RateBlock(
-            first_index=part.first,
-            device_time=part.first / self.sample_rate,
-            arrival_time=now,
-            counts=counts,
-            rate_lsb=units.rate_lsb,
-            temperature=units.celsius(float(messages["temperature"].mean())),
-            specific_force=_specific_force(messages),
-            status=GyroStatus(status) | (GyroStatus.OVERRUN if part.unsure else GyroStatus.OK),
-            n_lost=part.n_lost,
-        )
+    def _beside(self, messages: NDArray[np.void]) -> tuple[float, Vector | None]:
+        """Return temperature and specific force."""
+        return self.found.units.celsius(float(messages["temperature"].mean())), _specific_force(messages)
 
 
 def _tells_of_test(heard: bytes) -> bool:
     return find_test(heard) is not None
 
 
-def _specific_force(messages: NDArray[np.void]) -> tuple[float, float, float] | None:
+def _specific_force(messages: NDArray[np.void]) -> Vector | None:
     """Return the mean of the accelerometers in m/s^2, None if there are none or they are not valid."""
     if (messages["status"] & ACCELEROMETERS_VALID != ACCELEROMETERS_VALID).any():
         return None

@@ -11,7 +11,6 @@ import re
 from dataclasses import dataclass
 from typing import Self
 
-from drivers.api import Clock
 from drivers.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 from drivers.frame_stream import FrameStream
 from drivers.protocol.kvh import Units, decoder, speaks_format_c
@@ -20,7 +19,6 @@ DATA_RATES = (1, 5, 10, 25, 50, 100, 250, 500, 750, 1000, 3600, 5000)  #: Hz
 TEMPERATURE_UNITS = ("C", "C_100", "F", "F_100")
 _PATIENCE = 0.5  # s
 _ATTEMPTS = 3
-_MAX_HEARD = 4096  # bytes that are searched for an answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +33,8 @@ class Found:
 class ConfigurationMode:
     """A visit to configuration mode, as a context: whatever happens in it, the unit sends samples again after it."""
 
-    def __init__(self, stream: FrameStream, clock: Clock) -> None:
+    def __init__(self, stream: FrameStream) -> None:
         self._stream = stream
-        self._clock = clock
 
     def __enter__(self) -> Self:
         heard, answer = self._exchange("=CONFIG,1", "CONFIG")
@@ -69,18 +66,13 @@ class ConfigurationMode:
         heard = b""
         for _ in range(_ATTEMPTS):
             self._stream.link.write(command.encode("ascii") + b"\r\n")
-            deadline = self._clock.now() + _PATIENCE
-            while True:
-                heard = heard[-_MAX_HEARD:] + self._stream.take_raw()
-                if found := answer.search(heard):
-                    return heard, "" if found[1] else found[2].decode("ascii")
-                if self._clock.now() >= deadline:
-                    break
-                self._clock.wait(deadline)
+            heard, found = self._stream.hear(answer.search, patience=_PATIENCE, heard=heard)
+            if found is not None:
+                return heard, "" if found[1] else found[2].decode("ascii")
         return heard, None
 
 
-def configure(stream: FrameStream, clock: Clock, *, data_rate: int | None, may_set: bool) -> Found:
+def configure(stream: FrameStream, *, data_rate: int | None, may_set: bool) -> Found:
     """Ask a unit what it is set to, and set its data rate if that is asked for and allowed.
 
     Raises
@@ -93,7 +85,7 @@ def configure(stream: FrameStream, clock: Clock, *, data_rate: int | None, may_s
         If it is set otherwise than asked for and that may not or cannot be changed.
     """
     name = stream.link.name
-    with ConfigurationMode(stream, clock) as mode:
+    with ConfigurationMode(stream) as mode:
         found = _ask_all(mode, name)
         if data_rate not in {None, found.units.data_rate}:
             if not may_set:

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
 from drivers.errors import DeviceError, DeviceFaultError, ProtocolError
-from drivers.frame_stream import BATCH_TIME, LONGEST_BLOCK, FrameStream, SampleReader
+from drivers.frame_stream import FrameStream
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
-from drivers.protocol.sample_index import CounterError, Part, SampleIndex, parts
 from drivers.protocol.stim300 import (
     CONFIGURATION,
     COUNTER_RATE,
@@ -32,6 +31,7 @@ from drivers.protocol.stim300 import (
     triple,
     wire_size,
 )
+from drivers.sample_reader import BATCH_TIME, SampleFormat, SampleReader, Samples, Vector
 from drivers.stim300.settings import Settings, apply
 
 START_UP_TIME = 3.0  # s, in which the self-test waits for the end of the start-up
@@ -74,7 +74,6 @@ class Stim300Gyro:
         self._stream = FrameStream(link, clock, decoder(), what="STIM300")
         self._reader = SampleReader(self._stream, clock)
         self._configuration: Configuration | None = None
-        self._index = SampleIndex(span=COUNTER_SPAN, step=1, sample_rate=COUNTER_RATE)
         self._integral: NDArray[np.int32] | None = None
 
     @property
@@ -116,7 +115,7 @@ class Stim300Gyro:
         serial = parse_serial_number(self._ask(b"I\r", SERIAL_NUMBER)[0])
         self._configuration = parse_configuration(self._ask(b"C\r", CONFIGURATION)[0])
         if self._settings.differs_from(self._configuration):
-            apply(self._settings, self._stream, self._clock)
+            apply(self._settings, self._stream)
             self._configuration = parse_configuration(self._ask(b"C\r", CONFIGURATION)[0])
             self._settings.check(self._configuration)
         self._check(self._configuration)
@@ -153,9 +152,17 @@ class Stim300Gyro:
         answer, waiting = self._ask(b"C\r", CONFIGURATION)
         if parse_configuration(answer) != before:
             raise DeviceFaultError(f"{self._stream.link.name} has another configuration than when it was connected")
-        self._index = SampleIndex(span=COUNTER_SPAN, step=COUNTER_RATE // rate, sample_rate=rate)
         self._integral = None
-        self._reader.begin(self._blocks, sample_rate=rate, frame_size=_datagram_size(before), waiting=waiting)
+        form = SampleFormat(
+            decode=self._decode,
+            beside=self._beside,
+            frame_size=_datagram_size(before),
+            sample_rate=rate,
+            rate_lsb=before.rate_lsb,
+            span=COUNTER_SPAN,
+            step=COUNTER_RATE // rate,
+        )
+        self._reader.begin(form, waiting=waiting)
 
     def read(self) -> list[RateBlock]:
         """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.
@@ -204,8 +211,8 @@ class Stim300Gyro:
                 "samples would be lost"
             )
 
-    def _blocks(self, frames: list[Frames], now: float) -> tuple[list[RateBlock], DeviceError | None]:
-        """Return the samples among the frames as blocks, up to what is wrong."""
+    def _decode(self, frames: list[Frames]) -> tuple[Samples | None, DeviceError | None]:
+        """Return the samples among the frames, up to what is wrong."""
         runs, failure = [], None
         for run in frames:
             failure = self._wrong(run.header[0])
@@ -214,12 +221,16 @@ class Stim300Gyro:
             if run.header[0] in SAMPLE_IDS:
                 runs.append(decode_samples(run))
         if not runs:
-            return [], failure
-        try:
-            return self._number(np.concatenate(runs) if len(runs) > 1 else runs[0], now), failure
-        except CounterError as error:
-            name = self._stream.link.name
-            return [], DeviceFaultError(f"{name} has a sample counter that {error}: was it reset?")
+            return None, failure
+        samples = np.concatenate(runs) if len(runs) > 1 else runs[0]
+        counts = triple(samples, "rate")
+        integrates = self.configuration.gyro is Output.INTEGRAL
+        if integrates:
+            samples, counts = self._differences(samples, counts)
+            if not len(samples):
+                return None, failure
+        status = GYRO_STATUS[samples["rate_status"]]
+        return Samples(samples, samples["counter"], counts, status, differences=integrates), failure
 
     def _wrong(self, identifier: int) -> DeviceError | None:
         """Return what is wrong with a datagram in the stream."""
@@ -229,26 +240,6 @@ class Stim300Gyro:
         if SAMPLE_IDS.get(identifier, self.configuration.clusters) != self.configuration.clusters:
             return ProtocolError(f"{name} sends datagrams {identifier:02X}, which are not those it is set to")
         return None
-
-    def _number(self, samples: NDArray[np.void], now: float) -> list[RateBlock]:
-        """Return datagrams of samples as blocks."""
-        counts = triple(samples, "rate")
-        integrates = self.configuration.gyro is Output.INTEGRAL
-        if integrates:
-            samples, counts = self._differences(samples, counts)
-            if not len(samples):
-                return []
-        expected = self._index.next_index
-        numbered = self._index.number(samples["counter"], now, damaged=self._stream.damaged())
-        if integrates:  # a difference over a gap is no sample
-            whole = np.diff(numbered.index, prepend=expected - 1) == 1
-            samples, counts, numbered = samples[whole], counts[whole], numbered.only(whole)
-        status = GYRO_STATUS[samples["rate_status"]]
-        longest = round(LONGEST_BLOCK * self.sample_rate)
-        return [
-            self._block(samples[part.where], counts[part.where], part, status=int(status[part.where.start]), now=now)
-            for part in parts(numbered, status, expected=expected, longest=longest)
-        ]
 
     def _differences(
         self, samples: NDArray[np.void], counts: NDArray[np.int32]
@@ -260,26 +251,14 @@ class Stim300Gyro:
         gone = counts - np.concatenate((before, counts[:-1]))
         return samples, (gone + _TURN // 2) % _TURN - _TURN // 2
 
-    def _block(
-        self, samples: NDArray[np.void], counts: NDArray[np.int32], part: Part, *, status: int, now: float
-    ) -> RateBlock:
-        found = self.configuration
+    def _beside(self, samples: NDArray[np.void]) -> tuple[float | None, Vector | None]:
+        """Return temperature and specific force, where they are among what the unit sends."""
         temperature = None
-        if Cluster.TEMPERATURE in found.clusters:
+        if Cluster.TEMPERATURE in self.configuration.clusters:
             temperature = float(samples["rate_temperature"].mean()) / 256
-        return RateBlock(
-            first_index=part.first,
-            device_time=part.first / self.sample_rate,
-            arrival_time=now,
-            counts=counts,
-            rate_lsb=found.rate_lsb,
-            temperature=temperature,
-            specific_force=self._specific_force(samples),
-            status=GyroStatus(status) | (GyroStatus.OVERRUN if part.unsure else GyroStatus.OK),
-            n_lost=part.n_lost,
-        )
+        return temperature, self._specific_force(samples)
 
-    def _specific_force(self, samples: NDArray[np.void]) -> tuple[float, float, float] | None:
+    def _specific_force(self, samples: NDArray[np.void]) -> Vector | None:
         """Return the mean of the accelerometers, or else of the inclinometers, in m/s^2, None if it is not sound."""
         found = self.configuration
         for cluster, name, lsb in (

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.api import Clock
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError
 from drivers.frame_stream import FrameStream
 from drivers.protocol.stim300 import Configuration, Output
-from drivers.protocol.stim300_utility import ENTER, ENTERED, MAX_REPLY, REFUSALS, Reply, encode_command, parse_replies
+from drivers.protocol.stim300_utility import ENTER, ENTERED, REFUSALS, Reply, encode_command, parse_replies
 
 SAMPLE_RATES = (125, 250, 500, 1000, 2000)  #: Hz, by their codes
 OUTPUTS = {"rate": Output.RATE, "increment": Output.INCREMENT, "average": Output.AVERAGE, "integral": Output.INTEGRAL}
@@ -55,7 +54,7 @@ class Settings:
         return ""
 
 
-def apply(settings: Settings, stream: FrameStream, clock: Clock) -> None:
+def apply(settings: Settings, stream: FrameStream) -> None:
     """Set the unit, until it is switched off: nothing is saved. It sends no samples meanwhile.
 
     Raises
@@ -66,39 +65,37 @@ def apply(settings: Settings, stream: FrameStream, clock: Clock) -> None:
         If it refuses a setting.
     """
     stream.link.write(ENTER)
-    _reply(stream, clock, ENTERED)
+    _reply(stream, ENTERED)
     try:
         if settings.sample_rate is not None:
-            _command(stream, clock, "sm", SAMPLE_RATES.index(settings.sample_rate))
+            _command(stream, "sm", SAMPLE_RATES.index(settings.sample_rate))
         if settings.output is not None:
-            _command(stream, clock, "sgu", settings.output.value)
+            _command(stream, "sgu", settings.output.value)
     except DeviceError:
         stream.link.write(encode_command("xn"))  # whatever happened, it shall not stay silent
         raise
-    _command(stream, clock, "xn")
+    _command(stream, "xn")
 
 
-def _command(stream: FrameStream, clock: Clock, command: str, *parameters: int) -> None:
+def _command(stream: FrameStream, command: str, *parameters: int) -> None:
     stream.link.write(encode_command(command, *parameters))
-    reply = _reply(stream, clock, command)
+    reply = _reply(stream, command)
     if reply.status:
         why = REFUSALS.get(reply.status, f"status {reply.status}")
         asked = ",".join(map(str, (f"${command}", *parameters)))
         raise DeviceFaultError(f"{stream.link.name} refuses {asked}: {why}")
 
 
-def _reply(stream: FrameStream, clock: Clock, command: str) -> Reply:
+def _reply(stream: FrameStream, command: str) -> Reply:
     """Return the reply to a command, or to one that was not understood."""
-    deadline = clock.now() + _PATIENCE
-    heard = b""
-    while True:
-        heard = heard[-MAX_REPLY:] + stream.take_raw()
-        for reply in parse_replies(heard):
-            if reply.command in {command, ""}:
-                return reply
-        if clock.now() >= deadline:
-            raise DeviceTimeoutError(
-                f"{stream.link.name} does not answer {command} in utility mode: an older unit has none, "
-                "set it in service mode"
-            )
-        clock.wait(deadline)
+
+    def find(heard: bytes) -> Reply | None:
+        return next((reply for reply in parse_replies(heard) if reply.command in {command, ""}), None)
+
+    _, reply = stream.hear(find, patience=_PATIENCE)
+    if reply is None:
+        raise DeviceTimeoutError(
+            f"{stream.link.name} does not answer {command} in utility mode: an older unit has none, "
+            "set it in service mode"
+        )
+    return reply
