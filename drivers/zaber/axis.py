@@ -16,6 +16,7 @@ from drivers.protocol.zaber import (
     Reply,
     integers,
 )
+from drivers.zaber.identity import Device
 from drivers.zaber.line import Line, Target
 from drivers.zaber.options import KNOWN_UNITS_PER_DEG, AxisOptions
 
@@ -59,22 +60,22 @@ class ZaberAxis:
         """How near to a place the axis counts as there, rad."""
         return max(TOLERANCE, 4 * self.half_unit)
 
-    def meet(self, device_id: int, firmware: tuple[int, int]) -> AxisLimits:
-        """Read what the axis can do.
+    def meet(self, device: Device) -> AxisLimits:
+        """Read what the axis of a device can do.
 
         Raises
         ------
         ValueError
             If its microsteps a degree are neither configured nor known.
         """
-        per_deg = self.options.units_per_deg or KNOWN_UNITS_PER_DEG.get(device_id)
+        per_deg = self.options.units_per_deg or KNOWN_UNITS_PER_DEG.get(device.device_id)
         if per_deg is None:
             raise ValueError(
                 f"how far a microstep of {self.name} goes is not known: set {self.options.name}_units_per_deg to the "
-                f"microsteps of one degree; for this device, id {device_id}, look in its data sheet"
+                f"microsteps of one degree; for this device, id {device.device_id}, look in its data sheet"
             )
         self._units = degrees(per_deg)  # microsteps a rad
-        self._has_velocity = firmware >= (7, 25)
+        self._has_velocity = device.firmware >= (7, 25)
         lowest, highest, self._own_speed, acceleration = (
             self._number(setting) for setting in ("limit.min", "limit.max", "maxspeed", "accel")
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from drivers.api import DeviceIdentity
 from drivers.protocol.zaber import LineDecoder, Reply, encode_command
+from drivers.zaber.identity import identity_of
 
 _QUESTIONS = {11: "get deviceid", 12: "get system.serial", 13: "get version"}
 
@@ -27,13 +28,7 @@ class ZaberRecogniser:
         for device in sorted(answers):
             told = answers[device]
             if len(told) > 1 and told.get(11, "0").isdecimal():
-                return DeviceIdentity(
-                    kind="stage",
-                    model=f"Zaber {told.get(11, '')}".strip(),
-                    serial_number=told.get(12, ""),
-                    firmware_version=told.get(13, ""),
-                    protocol="Zaber ASCII 2",
-                )
+                return identity_of(device_id=told.get(11, ""), serial_number=told.get(12, ""), version=told.get(13, ""))
         return None
 
 
