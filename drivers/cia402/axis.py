@@ -7,9 +7,7 @@ until `reset_fault`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import Enum
-from functools import partial
 
 from drivers.api import Clock, FrameLink
 from drivers.canopen.node import Node, load_dictionary
@@ -17,8 +15,6 @@ from drivers.canopen.pdo import PdoCodec
 from drivers.cia402.options import DriveOptions
 from drivers.cia402.words import (
     FAULTY,
-    HOMING,
-    PROFILE_POSITION,
     REFUSALS,
     UNKNOWN_FAULT,
     Control,
@@ -27,19 +23,16 @@ from drivers.cia402.words import (
     drive_state,
     fault_name,
 )
-from drivers.errors import DeviceFaultError
 
 EDS = "cia402_stage.eds"
 HOMING_START_TIME = 0.5  # s after which a homing that needs no motion is taken for one that has begun
 AXIS_NAMES = ("azimuth", "elevation")
 
-_CONTROL, _STATUS, _MODE, _MODE_SHOWN = (0x6040, 0), (0x6041, 0), (0x6060, 0), (0x6061, 0)
+_CONTROL, _STATUS = (0x6040, 0), (0x6041, 0)
 _POSITION, _VELOCITY, _TARGET = (0x6064, 0), (0x606C, 0), (0x607A, 0)
 _SPEED = (0x6081, 0)
 _ERROR = (0x603F, 0)
 _DEVICE_TIME, _TIME_SEEN = (0x2110, 0), (0x2111, 0)
-
-Wait = Callable[[Callable[[], bool], str], None]  #: waits until something is so, which is named for messages
 
 
 class Activity(Enum):
@@ -192,22 +185,24 @@ class Axis:
             self._seen_ms = self.device_time_ms
             self.node.send(self._seen_codec.cob_id, self._seen_codec.encode({_TIME_SEEN: self._seen_ms or 0}))
 
-    # What waits
+    def hold(self) -> None:
+        """Let the target be where the axis is."""
+        self._target = self.position
+
+    def forget_fault(self) -> None:
+        """Take the axis for one without a fault."""
+        self.fault = self._cause = ""
+        self.node.emergencies.clear()
+
+    # What waits for an answer
 
     def read_status(self) -> None:
         """Read by SDO what the PDOs will tell later."""
         self.statusword, self.position = self.node.read(*_STATUS), self.node.read(*_POSITION)
         self.velocity = self.node.read_optional(*_VELOCITY) or 0
-        self._target = self.position
+        self.hold()
         if self.state in FAULTY:
             self.fault = fault_name(self.node.read_optional(*_ERROR) or 0)
-
-    def set_mode(self, mode: int, wait: Wait) -> None:
-        """Change the mode of operation, and wait until the drive shows it."""
-        if self.node.read(*_MODE_SHOWN) != mode:
-            self.node.write(*_MODE, mode)
-            wait(lambda: self.node.read(*_MODE_SHOWN) == mode, f"mode of operation {mode}")
-        self.statusword = self.node.read(*_STATUS)
 
     def set_speed(self, speed: float) -> None:
         """Let moves go at `speed` in rad/s."""
@@ -215,63 +210,6 @@ class Axis:
         if units != self._speed:
             self.node.write(*_SPEED, units, verify=True)
             self._speed = units
-
-    def see_homed(self, wait: Wait) -> None:
-        """Ask an axis at rest whether it is homed: in homing mode bit 12 tells."""
-        self.set_mode(HOMING, wait)
-        self.homed = bool(self.statusword & Status.HOMED)
-
-    def enable(self, mode: int, wait: Wait) -> None:
-        """Bring an axis at rest to OPERATION ENABLED in a mode of operation.
-
-        Raises
-        ------
-        DeviceFaultError
-            If the drive faults.
-        DeviceTimeoutError
-            If it does not go there.
-        """
-        self.set_mode(mode, wait)
-        if mode == PROFILE_POSITION:
-            self._target = self.position
-        if self.state is DriveState.OPERATION_ENABLED:
-            return
-        for word, state in (
-            (Control.DISABLE_VOLTAGE, DriveState.SWITCH_ON_DISABLED),
-            (Control.SHUTDOWN, DriveState.READY_TO_SWITCH_ON),
-            (Control.SWITCH_ON, DriveState.SWITCHED_ON),
-            (Control.ENABLE, DriveState.OPERATION_ENABLED),
-        ):
-            self.control(word)
-            wait(partial(self._reached, state), f"the state {state.name}")
-
-    def reset_fault(self, wait: Wait) -> None:
-        """Reset a latched fault; the drive stays without power. Never moves.
-
-        Raises
-        ------
-        DeviceFaultError
-            If the axis still moves, or its fault cannot be reset yet.
-        """
-        if self.state is DriveState.FAULT_REACTION_ACTIVE:
-            raise DeviceFaultError(f"{self.name} still slows down: clear its fault once it is at rest")
-        if self.state is DriveState.FAULT:
-            self.control(Control.DISABLE_VOLTAGE)
-            self.control(Control.RESET_FAULT)
-            try:
-                wait(lambda: self.state not in FAULTY, "a reset of its fault")
-            except TimeoutError:
-                raise DeviceFaultError(f"{self.name} keeps the fault {self.fault}: its cause must go first") from None
-            self.control(Control.DISABLE_VOLTAGE)
-        self.fault = self._cause = ""
-        self.node.emergencies.clear()
-
-    def _reached(self, state: DriveState) -> bool:
-        if self.state in FAULTY:
-            raise DeviceFaultError(
-                f"{self.name} reports {self.fault}; it stays without power until the fault is cleared"
-            )
-        return self.state is state
 
     def _advance_homing(self, word: int) -> None:
         """Go one step on with a homing."""
@@ -285,7 +223,7 @@ class Axis:
         self.homed = bool(word & Status.HOMED) and not word & Status.HOMING_ERROR
         if not self.homed:
             self._note_fault("HOMING_FAILED")
-        self._target = self.position
+        self.hold()
         self.control(Control.ENABLE)
 
     def _take_emergencies(self) -> bool:

@@ -9,8 +9,9 @@ import canopen
 from drivers.api import DeviceIdentity, StageLimits
 from drivers.canopen.identity import PROTOCOL
 from drivers.canopen.node import HEARTBEAT_MS, MissingObjectError, Node
-from drivers.cia402.axis import AXIS_NAMES, Axis, Wait
+from drivers.cia402.axis import AXIS_NAMES, Axis
 from drivers.cia402.options import DriveOptions
+from drivers.cia402.power import Wait
 from drivers.cia402.words import FAULTY, Control, DriveState
 from drivers.errors import DeviceFaultError, ProtocolError
 from drivers.limits import AxisLimits

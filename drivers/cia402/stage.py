@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
-from drivers.api import Clock, DeviceIdentity, FrameLink, SelfTest, StageLimits, StageMode, StageState
+from drivers.api import Clock, DeviceIdentity, FrameLink, SelfTest, StageLimits, StageState
 from drivers.canopen.identity import run_self_test
-from drivers.canopen.node import MAX_SILENCE, OPERATIONAL, SERVICE_PERIOD
+from drivers.canopen.node import MAX_SILENCE, OPERATIONAL
 from drivers.cia402 import setup
 from drivers.cia402.axis import AXIS_NAMES, Activity, Axis
 from drivers.cia402.options import DriveOptions
+from drivers.cia402.pair import identity_of, state_of
+from drivers.cia402.power import enable, reset_fault, see_homed
+from drivers.cia402.presence import ANSWER_TIMEOUT, Presence
 from drivers.cia402.words import HOMING, PROFILE_POSITION, Control, DriveState
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError
 from drivers.limits import joined, require_within
 
 IDENTIFIERS = (0x080, 0x180, 0x280, 0x580, 0x700)  #: to which each node's number is added
-HEARTBEAT_PERIOD = 0.05  # s of host time; half of what the drives are promised, so that a late call does no harm
-HEARTBEAT_SPAN_MS = 100  # of device time
-ANSWER_TIMEOUT = 1.0  # s for a drive to go where it was told
 REST_TIMEOUT = 10.0  # s for a drive found moving to come to rest
 STOP_INTERVAL = 0.05  # s between repetitions of a stop
 STOP_ATTEMPTS = 20
-_MODES = {
-    Activity.OFFERED: StageMode.MOVING,
-    Activity.TAKEN: StageMode.MOVING,
-    Activity.MOVING: StageMode.MOVING,
-    Activity.HOMING_ASKED: StageMode.HOMING,
-    Activity.HOMING: StageMode.HOMING,
-    Activity.STOPPING: StageMode.STOPPING,
-}
-_ORDER = (StageMode.STOPPING, StageMode.HOMING, StageMode.MOVING)  # what the stage does if its axes differ
 
 
 class Cia402Stage:
@@ -73,14 +63,11 @@ class Cia402Stage:
             for index, (link, node_id) in enumerate(zip(links, node_ids, strict=True))
         ]
         for axis in self._axes:
-            axis.node.duty = self._beat
             axis.node.max_silence = max_silence
+        self._presence = Presence(self._axes, clock)
         self._own_limits = limits
         self._limits: StageLimits | None = None
         self._state: StageState | None = None
-        self._connected = False
-        self._beaten_at = 0.0
-        self._beaten_ms = 0
 
     @property
     def limits(self) -> StageLimits:
@@ -101,22 +88,22 @@ class Cia402Stage:
         DeviceFaultError
             If a drive refuses what it must be told.
         """
-        self._state, self._limits, self._connected = None, None, False
+        self._state, self._limits, self._presence.connected = None, None, False
         identities = [setup.meet(axis) for axis in self._axes]
         for axis in self._axes:
-            setup.bring_to_rest(axis, self._waiter(axis, REST_TIMEOUT))
+            setup.bring_to_rest(axis, self._presence.waiter(axis, REST_TIMEOUT))
             setup.configure(axis)
             setup.map_pdos(axis)
-            axis.see_homed(self._waiter(axis))
+            see_homed(axis, self._presence.waiter(axis))
         self._limits = joined(*(setup.limits_of(axis, self._own_limits) for axis in self._axes))
-        self._connected = True
+        self._presence.connected = True
         for axis in self._axes:
             axis.node.order("OPERATIONAL")
         for axis in self._axes:
-            self._waiter(axis)(partial(axis.node.stands_in, OPERATIONAL), "OPERATIONAL")
+            self._presence.waiter(axis)(partial(axis.node.stands_in, OPERATIONAL), "OPERATIONAL")
             axis.node.watch()
         self._state = self._newest()
-        return self._identity(identities)
+        return identity_of(*identities)
 
     def self_test(self) -> SelfTest:
         """Run the self-test of drives that have one, up to 3 s each. Never moves."""
@@ -216,16 +203,16 @@ class Cia402Stage:
         """
         self._require_connected()
         for axis in self._axes:
-            axis.reset_fault(self._waiter(axis))
+            reset_fault(axis, self._presence.waiter(axis))
         for axis in self._axes:
             if axis.activity is Activity.REST:
-                axis.see_homed(self._waiter(axis))
+                see_homed(axis, self._presence.waiter(axis))
         self._state = self._newest()
 
     def close(self) -> None:
         """Stop the stage if the bus still lives, take the power off drives at rest, and release the bus."""
         try:
-            if self._connected:
+            if self._presence.connected:
                 self._stop(6)
                 for axis in self._axes:
                     if axis.activity is Activity.REST and axis.state is DriveState.OPERATION_ENABLED:
@@ -234,7 +221,7 @@ class Cia402Stage:
         except DeviceError:
             pass  # without heartbeats the drives stop by themselves
         finally:
-            self._connected = False
+            self._presence.connected = False
             for axis in self._axes:
                 axis.node.close()
 
@@ -244,43 +231,8 @@ class Cia402Stage:
     def _names(self) -> str:
         return " and ".join(axis.name for axis in self._axes)
 
-    def _identity(self, identities: list[DeviceIdentity]) -> DeviceIdentity:
-        """Return two drives as one device."""
-        first, second = identities
-        return replace(first, serial_number=", ".join(dict.fromkeys((first.serial_number, second.serial_number))))
-
     def _newest(self) -> StageState:
-        """Return the state by what the axes have told."""
-        azimuth, elevation = self._axes
-        told_ms = [axis.device_time_ms for axis in self._axes if axis.device_time_ms is not None]
-        now = self._clock.now()
-        return StageState(
-            device_time=max(told_ms) / 1000 if told_ms else now,
-            arrival_time=now,
-            mode=self._mode(),
-            azimuth=azimuth.position / azimuth.units,
-            elevation=elevation.position / elevation.units,
-            azimuth_rate=azimuth.velocity / azimuth.speed_units,
-            elevation_rate=elevation.velocity / elevation.speed_units,
-            in_position=azimuth.in_position and elevation.in_position,
-            fault=self._fault(),
-        )
-
-    def _mode(self) -> StageMode:
-        if any(axis.fault for axis in self._axes):
-            return StageMode.FAULT
-        modes = {_MODES.get(axis.activity) for axis in self._axes}
-        for mode in _ORDER:
-            if mode in modes:
-                return mode
-        return StageMode.IDLE if all(axis.homed for axis in self._axes) else StageMode.NOT_HOMED
-
-    def _fault(self) -> str:
-        """Return the faults of both axes by name."""
-        faults = [axis.fault for axis in self._axes]
-        if faults[0] == faults[1]:
-            return faults[0]
-        return ", ".join(f"{fault} ({AXIS_NAMES[index]})" for index, fault in enumerate(faults) if fault)
+        return state_of(self._axes, self._clock.now())
 
     def _stop_moving(self) -> None:
         """Stop each axis that moves and is not being stopped."""
@@ -297,7 +249,7 @@ class Cia402Stage:
             while self._clock.now() < deadline:
                 if not any(axis.state is DriveState.OPERATION_ENABLED for axis in stopping):
                     return
-                self._wait(deadline)
+                self._presence.wait(deadline)
             for axis in stopping:
                 axis.quick_stop()
         if stopping:
@@ -308,10 +260,10 @@ class Cia402Stage:
 
     def _enable(self, mode: int) -> None:
         for axis in self._axes:
-            axis.enable(mode, self._waiter(axis))
+            enable(axis, mode, self._presence.waiter(axis))
 
     def _require_connected(self) -> None:
-        if not self._connected:
+        if not self._presence.connected:
             raise LinkError(f"{self._names} are not connected: connect first")
 
     def _require_rest(self, what: str) -> None:
@@ -322,8 +274,6 @@ class Cia402Stage:
                 raise DeviceFaultError(f"{axis.name} refuses {what}: the fault {axis.fault} must be cleared first")
             if axis.activity is not Activity.REST:
                 raise DeviceFaultError(f"{axis.name} refuses {what}: it must be at rest first")
-
-    # Waiting, and the heartbeat that goes on meanwhile
 
     def _await_both(self, so: Callable[[Axis], bool], what: str) -> None:
         """Wait until something is so of both axes; stop both and raise if it does not come to that."""
@@ -342,39 +292,7 @@ class Cia402Stage:
                     if troubled
                     else DeviceTimeoutError(f"{missing[0].name} has not {what} within {ANSWER_TIMEOUT:g} s")
                 )
-            self._wait(deadline)
-
-    def _waiter(self, axis: Axis, timeout: float = ANSWER_TIMEOUT) -> Callable[[Callable[[], bool], str], None]:
-        """Return what waits until something is so of an axis, and raises DeviceTimeoutError if it does not come."""
-
-        def wait(so: Callable[[], bool], what: str) -> None:
-            deadline = self._clock.now() + timeout
-            while not so():
-                if self._clock.now() >= deadline:
-                    raise DeviceTimeoutError(f"{axis.name} has not come to {what} within {timeout:g} s")
-                self._wait(deadline)
-
-        return wait
-
-    def _wait(self, deadline: float) -> None:
-        """Let a service period pass, or less if something comes."""
-        heard = [axis.take_in() for axis in self._axes]
-        if not any(heard):
-            self._clock.wait(min(deadline, self._clock.now() + SERVICE_PERIOD))
-            for axis in self._axes:
-                axis.take_in()
-
-    def _beat(self) -> None:
-        """Send the host's heartbeat if it is time; so before anything new is looked at."""
-        if not self._connected:
-            return
-        now = self._clock.now()
-        newest_ms = max(axis.device_time_ms or 0 for axis in self._axes)
-        if newest_ms - self._beaten_ms >= HEARTBEAT_SPAN_MS or now - self._beaten_at >= HEARTBEAT_PERIOD:
-            self._beaten_at, self._beaten_ms = now, newest_ms
-            self._axes[0].node.send(0x700 + setup.HOST_NODE, b"\x05")
-        for axis in self._axes:
-            axis.acknowledge()
+            self._presence.wait(deadline)
 
 
 def _trouble(axis: Axis) -> DeviceFaultError:
