@@ -4,5 +4,5 @@ The ``canopen`` package reads the EDS files, keeps the object dictionary, maps P
 itself it would receive in a thread of its own and wait in real time; here it does neither. `network` gives it a bus
 that sends through a `drivers.api.FrameLink`, and an SDO client that waits by `Clock.wait`, so that everything works in
 virtual time too, and no driver needs a lock. `node` is what the drivers use: it takes in the frames and says what went
-wrong. `pdo` decodes many frames at once.
+wrong; `objects` reads and writes by SDO. `pdo` decodes many frames at once.
 """

@@ -25,29 +25,31 @@ def identify(node: Node, kind: str) -> DeviceIdentity:
         If it is another device or of another revision, or two nodes answer.
     """
     node.greet()
+    objects = node.objects
     for subindex, what in ((1, "vendor"), (2, "product"), (3, "revision")):
-        found, expected = node.read(_IDENTITY, subindex), node.default(_IDENTITY, subindex)
+        found, expected = objects.read(_IDENTITY, subindex), objects.default(_IDENTITY, subindex)
         shift = 16 if what == "revision" else 0  # the lower half counts changes that change nothing here
         if found >> shift != expected >> shift:
             raise ProtocolError(f"{node.name} is no {kind} of this protocol: its {what} is {found}, not {expected}")
     return DeviceIdentity(
         kind=kind,
-        model=node.read_text(0x1008),
-        serial_number=node.read_text(_SERIAL_NUMBER),
-        firmware_version=node.read_text(0x100A),
+        model=objects.read_text(0x1008),
+        serial_number=objects.read_text(_SERIAL_NUMBER),
+        firmware_version=objects.read_text(0x100A),
         protocol=PROTOCOL,
-        boot_count=node.read(_BOOT_COUNT),
+        boot_count=objects.read(_BOOT_COUNT),
     )
 
 
 def run_self_test(node: Node, clock: Clock) -> SelfTest:
     """Run a node's self-test and return its failures by name. Raises DeviceTimeoutError if it does not end in 3 s."""
-    node.write(_TEST, 1, 1)
+    objects = node.objects
+    objects.write(_TEST, 1, 1)
     deadline = clock.now() + _TEST_TIMEOUT
-    while node.read(_TEST, 2) != _DONE:
+    while objects.read(_TEST, 2) != _DONE:
         if clock.now() >= deadline:
             raise DeviceTimeoutError(f"the self-test of {node.name} has not ended within {_TEST_TIMEOUT:g} s")
         pause = clock.now() + SERVICE_PERIOD
         while clock.now() < pause:
             node.wait(pause)
-    return SelfTest(self_test_failures(node.read(_TEST, 3)))
+    return SelfTest(self_test_failures(objects.read(_TEST, 3)))

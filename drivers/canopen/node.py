@@ -1,6 +1,6 @@
-"""One CANopen node as the drivers see it: objects read and written, PDOs collected, its life watched.
+"""One CANopen node as the drivers see it: PDOs collected, its life watched, its objects in `drivers.canopen.objects`.
 
-Nothing here waits but `read`, `write`, `wait` and what is built on them. `service` sorts what has arrived; whatever a
+Nothing here waits but `wait`, what is built on it, and access to objects. `service` sorts what has arrived; whatever a
 frame holds, it raises nothing but DeviceError.
 """
 
@@ -8,22 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import canopen
 import numpy as np
 from canopen.emcy import EmcyError
-from canopen.objectdictionary import ODVariable
-from canopen.objectdictionary.datatypes import SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
-from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from numpy.typing import NDArray
 
 from drivers.api import Clock, FrameLink
-from drivers.canopen.network import SDO_TIMEOUT, LinkNetwork, LinkNode, SilenceError
+from drivers.canopen.network import LinkNetwork, LinkNode
+from drivers.canopen.objects import Objects
 from drivers.canopen.pdo import PdoCodec
-from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
-from drivers.protocol.text import unpadded
+from drivers.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 
 EDS_FOLDER = Path(__file__).parent.parent / "eds"
 HEARTBEAT_MS = 100  #: of a node, as the drivers ask for it
@@ -34,18 +30,9 @@ MAX_WAITING = 4096  # frames of one PDO that wait for the driver
 OPERATIONAL = 5
 PRE_OPERATIONAL = 127
 _STATES = {0, 4, OPERATIONAL, PRE_OPERATIONAL}  # of a heartbeat: boot-up, stopped, these
-T = TypeVar("T")
-_ATTEMPTS = 3
 _STATE_TIMEOUT = 1.0  # s
 _TWIN_TIME = 0.02  # s in which a second node of the same number would answer
 _IDENTITY = 0x1018
-#: Abort codes by which a device refuses what host and device both understand.
-_REFUSALS = {0x06060000, 0x06090030, 0x06090031, 0x06090032, 0x08000020, 0x08000021, 0x08000022}
-_MISSING = {0x06020000, 0x06090011}
-
-
-class MissingObjectError(ProtocolError):
-    """The device has no such object."""
 
 
 def load_dictionary(name: str, node_id: int) -> canopen.ObjectDictionary:
@@ -84,6 +71,7 @@ class Node:
         self._clock = clock
         self._network = LinkNetwork(link)
         self._network.add_node(self.remote)
+        self.objects = Objects(self.remote, self.name)
         self._pdos: dict[int, list[bytes]] = {}
         self._silence = 0.0
         self._looked_at = clock.now()
@@ -210,53 +198,6 @@ class Node:
                 raise DeviceTimeoutError(f"{self.name} has not become {state} within {_STATE_TIMEOUT:g} s")
             self.wait(deadline)
 
-    # Objects
-
-    def read(self, index: int, subindex: int = 0) -> int:
-        """Return the value of a number.
-
-        Raises
-        ------
-        DeviceTimeoutError
-            If the node does not answer.
-        ProtocolError, DeviceFaultError
-            If it refuses, or answers with something else.
-        """
-        variable = self._variable(index, subindex)
-        data = self._transfer(f"reading {_called(variable)}", lambda: self.remote.sdo.upload(index, subindex))
-        if len(data) * 8 != len(variable):
-            raise ProtocolError(
-                f"{self.name} answered {len(data)} bytes for {_called(variable)}, {len(variable) // 8} were expected"
-            )
-        return int.from_bytes(data, "little", signed=variable.data_type in SIGNED_TYPES)
-
-    def default(self, index: int, subindex: int = 0) -> int:
-        """Return what the object dictionary says of a number's value at start, 0 if nothing."""
-        return self._variable(index, subindex).default or 0
-
-    def read_optional(self, index: int, subindex: int = 0) -> int | None:
-        """Return the value of a number, None if the node has no such object."""
-        try:
-            return self.read(index, subindex)
-        except MissingObjectError:
-            return None
-
-    def read_text(self, index: int) -> str:
-        """Return a text up to its padding, printable: what else there is becomes ``?``. Raises as `read`."""
-        variable = self._variable(index, 0)
-        data = self._transfer(f"reading {_called(variable)}", lambda: self.remote.sdo.upload(index, 0))
-        return unpadded(data)
-
-    def write(self, index: int, subindex: int, value: int, *, verify: bool = False) -> None:
-        """Write a number, and read it back if asked to. Raises as `read`; ProtocolError if it reads back otherwise."""
-        variable = self._variable(index, subindex)
-        signed = variable.data_type in SIGNED_TYPES
-        data = value.to_bytes(len(variable) // 8, "little", signed=signed)
-        what = f"writing {value} to {_called(variable)}"
-        self._transfer(what, lambda: self.remote.sdo.download(index, subindex, data))
-        if verify and (kept := self.read(index, subindex)) != value:
-            raise ProtocolError(f"{self.name} kept {kept} after {what}")
-
     def greet(self) -> None:
         """See that the node answers, and that it is the only one of its number.
 
@@ -268,7 +209,7 @@ class Node:
             If two nodes answer.
         """
         try:
-            serial_number = self.read(_IDENTITY, 4)
+            serial_number = self.objects.read(_IDENTITY, 4)
         except DeviceTimeoutError:
             raise self._unheard() from None
         responses = self.remote.sdo.responses
@@ -282,32 +223,6 @@ class Node:
                 f"and {second}: give one of them another number"
             )
 
-    def save(self, pdo: canopen.pdo.PdoMap) -> None:
-        """Give the node a PDO's parameters and mapping. Raises as `read`."""
-        self._transfer(f"its mapping of PDO {pdo.cob_id or 0:03X}", pdo.save)
-
-    def _transfer(self, what: str, transfer: Callable[[], T]) -> T:
-        """Run a transfer, up to three times if nothing answers; turn canopen's exceptions into ours."""
-        for _ in range(_ATTEMPTS):
-            self.remote.sdo.n_answers = 0
-            try:
-                return transfer()
-            except SilenceError:
-                continue
-            except SdoAbortedError as error:
-                raise self._refusal(what, error) from None
-            except SdoCommunicationError as error:
-                raise ProtocolError(f"{self.name} does not answer {what} as it should: {error}") from None
-        raise DeviceTimeoutError(f"{self.name} did not answer {what} within {_ATTEMPTS * SDO_TIMEOUT:.1f} s")
-
-    def _refusal(self, what: str, error: SdoAbortedError) -> DeviceError:
-        text = (
-            f"{self.name} refused {what}: {SdoAbortedError.CODES.get(error.code, 'unknown reason')} ({error.code:08X})"
-        )
-        if error.code in _MISSING:
-            return MissingObjectError(text)
-        return DeviceFaultError(text) if error.code in _REFUSALS else ProtocolError(text)
-
     def _unheard(self) -> DeviceTimeoutError:
         """Return the exception for a node that does not answer, with what was heard on the bus instead."""
         counts = self._link.counts
@@ -320,12 +235,6 @@ class Node:
             heard = "the bus is silent: is it powered, and is this its bit rate?"
         return DeviceTimeoutError(f"{self.name} does not answer; {heard}")
 
-    def _variable(self, index: int, subindex: int) -> ODVariable:
-        variable = self.remote.object_dictionary.get_variable(index, subindex)
-        if variable is None:
-            raise ValueError(f"there is no object {index:04X}:{subindex} in the dictionary of {self.name}")
-        return variable
-
     def _on_heartbeat(self, state: int) -> None:
         """Take a heartbeat; state 0 is a boot-up message."""
         self.state = state
@@ -337,11 +246,3 @@ class Node:
         self.remote.emcy.reset()
         if len(self.emergencies) < MAX_WAITING:
             self.emergencies.append(emergency)
-
-
-def _called(variable: ODVariable) -> str:
-    """Return how an object is called, for messages: ``Boot count (2002)``."""
-    parent = variable.parent
-    if isinstance(parent, canopen.ObjectDictionary):
-        return f"{variable.name} ({variable.index:04X})"
-    return f"{variable.name} ({variable.index:04X}:{variable.subindex})"

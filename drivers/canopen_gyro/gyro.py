@@ -111,7 +111,7 @@ class CanopenGyro:
         node.order("PRE-OPERATIONAL")  # which stops a stream
         who = identify(node, "gyro")
         self._configure()
-        node.write(0x1017, 0, HEARTBEAT_MS, verify=True)
+        node.objects.write(0x1017, 0, HEARTBEAT_MS, verify=True)
         node.command("OPERATIONAL", OPERATIONAL)
         node.emergencies.clear()
         node.watch()
@@ -133,7 +133,7 @@ class CanopenGyro:
             self._node.take(codec.cob_id)  # of a stream before
         self._assembler = SampleAssembler(self._n_axes, self._sample_rate, self._block_samples)
         self._n_acknowledged = 0
-        self._node.write(_STREAM, 0, 1)
+        self._node.objects.write(_STREAM, 0, 1)
         self._heard_at = self._clock.now()
         self._streaming = True
 
@@ -164,14 +164,14 @@ class CanopenGyro:
 
     def stop(self) -> None:
         """Stop the sample stream. What was sent before can still be read."""
-        self._node.write(_STREAM, 0, 0)
+        self._node.objects.write(_STREAM, 0, 0)
         self._streaming = False
 
     def close(self) -> None:
         """Stop the stream if the bus still lives, and release it."""
         try:
             if self._streaming:
-                self._node.write(_STREAM, 0, 0)
+                self._node.objects.write(_STREAM, 0, 0)
             if self._connected:
                 self._node.order("PRE-OPERATIONAL")
         except DeviceError:
@@ -182,23 +182,23 @@ class CanopenGyro:
 
     def _configure(self) -> None:
         """Bring the configuration to what was asked for, and read what is in force."""
-        node = self._node
+        objects = self._node.objects
         if self._wanted_rate_millihz:
-            node.write(_SAMPLE_RATE, 0, self._wanted_rate_millihz, verify=True)
-        rate, self._n_axes = node.read(_SAMPLE_RATE), node.read(_N_AXES)
+            objects.write(_SAMPLE_RATE, 0, self._wanted_rate_millihz, verify=True)
+        rate, self._n_axes = objects.read(_SAMPLE_RATE), objects.read(_N_AXES)
         if self._wanted_block is not None:
-            node.write(_BURST, 0, max(1, min(MAX_BURST, round(self._wanted_block * rate / 1000))), verify=True)
-        self._burst = burst = node.read(_BURST)
+            objects.write(_BURST, 0, max(1, min(MAX_BURST, round(self._wanted_block * rate / 1000))), verify=True)
+        self._burst = burst = objects.read(_BURST)
         if self._n_axes not in {1, 3} or not rate or not burst:
             raise ProtocolError(
-                f"{node.name} reports an impossible configuration: {self._n_axes} axes, {rate} mHz, "
+                f"{objects.name} reports an impossible configuration: {self._n_axes} axes, {rate} mHz, "
                 f"{burst} samples a burst"
             )
         self._sample_rate = rate / 1000
-        self._range = node.read(_RANGE) * RATE_LSB * 2**10
+        self._range = objects.read(_RANGE) * RATE_LSB * 2**10
         usual = round(BLOCK_TIME * self._sample_rate)
         self._block_samples = burst if 2 * burst > usual else max(1, usual)
-        node.write(_SLOW_PERIOD, 0, max(100, round(1000 * self._block_samples / self._sample_rate)), verify=True)
+        objects.write(_SLOW_PERIOD, 0, max(100, round(1000 * self._block_samples / self._sample_rate)), verify=True)
 
     def _take_in(self) -> None:
         """Take in the PDOs that have come. Raises DeviceFaultError if one gyro cannot have sent them."""

@@ -198,17 +198,17 @@ class Axis:
 
     def read_status(self) -> None:
         """Read by SDO what the PDOs will tell later."""
-        self.statusword, self.position = self.node.read(*_STATUS), self.node.read(*_POSITION)
-        self.velocity = self.node.read_optional(*_VELOCITY) or 0
+        self.statusword, self.position = self.node.objects.read(*_STATUS), self.node.objects.read(*_POSITION)
+        self.velocity = self.node.objects.read_optional(*_VELOCITY) or 0
         self.hold()
         if self.state in FAULTY:
-            self.fault = fault_name(self.node.read_optional(*_ERROR) or 0)
+            self.fault = fault_name(self.node.objects.read_optional(*_ERROR) or 0)
 
     def set_speed(self, speed: float) -> None:
         """Let moves go at `speed` in rad/s."""
         units = max(1, round(speed * self.speed_units))
         if units != self._speed:
-            self.node.write(*_SPEED, units, verify=True)
+            self.node.objects.write(*_SPEED, units, verify=True)
             self._speed = units
 
     def _advance_homing(self, word: int) -> None:

@@ -68,10 +68,11 @@ def reset_fault(axis: Axis, wait: Wait) -> None:
 
 def _set_mode(axis: Axis, mode: int, wait: Wait) -> None:
     """Change the mode of operation, and wait until the drive shows it."""
-    if axis.node.read(*_MODE_SHOWN) != mode:
-        axis.node.write(*_MODE, mode)
-        wait(lambda: axis.node.read(*_MODE_SHOWN) == mode, f"mode of operation {mode}")
-    axis.statusword = axis.node.read(0x6041)
+    objects = axis.node.objects
+    if objects.read(*_MODE_SHOWN) != mode:
+        objects.write(*_MODE, mode)
+        wait(lambda: objects.read(*_MODE_SHOWN) == mode, f"mode of operation {mode}")
+    axis.statusword = objects.read(0x6041)
 
 
 def _reached(axis: Axis, state: DriveState) -> bool:

@@ -8,7 +8,8 @@ import canopen
 
 from drivers.api import DeviceIdentity, StageLimits
 from drivers.canopen.identity import PROTOCOL
-from drivers.canopen.node import HEARTBEAT_MS, MissingObjectError, Node
+from drivers.canopen.node import HEARTBEAT_MS
+from drivers.canopen.objects import MissingObjectError, Objects
 from drivers.cia402.axis import AXIS_NAMES, Axis
 from drivers.cia402.options import DriveOptions
 from drivers.cia402.power import Wait
@@ -34,21 +35,21 @@ def meet(axis: Axis) -> DeviceIdentity:
     ProtocolError
         If it is no drive, or the other axis.
     """
-    node = axis.node
+    node, objects = axis.node, axis.node.objects
     node.greet()
-    device_type = node.read(0x1000)
+    device_type = objects.read(0x1000)
     if device_type & 0xFFFF != _DRIVE_PROFILE:
         raise ProtocolError(f"{node.name} is no drive of CiA 402: its device type is {device_type:08X}")
-    axis.ours = all(node.read(0x1018, subindex) == node.default(0x1018, subindex) for subindex in (1, 2))
-    if axis.ours and node.read(0x2010) != axis.index:
+    axis.ours = all(objects.read(0x1018, subindex) == objects.default(0x1018, subindex) for subindex in (1, 2))
+    if axis.ours and objects.read(0x2010) != axis.index:
         raise ProtocolError(f"{node.name} is the other axis: name azimuth before elevation")
     return DeviceIdentity(
         kind="stage",
-        model=_text(node, 0x1008),
-        serial_number=node.read_text(0x2003) if axis.ours else str(node.read(0x1018, 4)),
-        firmware_version=_text(node, 0x100A),
+        model=_text(objects, 0x1008),
+        serial_number=objects.read_text(0x2003) if axis.ours else str(objects.read(0x1018, 4)),
+        firmware_version=_text(objects, 0x100A),
         protocol=f"{PROTOCOL}, CiA 402",
-        boot_count=node.read(0x2002) if axis.ours else 0,
+        boot_count=objects.read(0x2002) if axis.ours else 0,
     )
 
 
@@ -59,14 +60,14 @@ def bring_to_rest(axis: Axis, wait: Wait) -> None:
     if axis.state in FAULTY:
         return
     if axis.state is DriveState.OPERATION_ENABLED:
-        axis.node.write(0x6040, 0, Control.QUICK_STOP)
+        axis.node.objects.write(0x6040, 0, Control.QUICK_STOP)
 
         def rests() -> bool:
             axis.read_status()
             return not axis.velocity
 
         wait(rests, "rest")
-    axis.node.write(0x6040, 0, Control.DISABLE_VOLTAGE)
+    axis.node.objects.write(0x6040, 0, Control.DISABLE_VOLTAGE)
     axis.read_status()
 
 
@@ -78,50 +79,49 @@ def configure(axis: Axis) -> None:
     DeviceFaultError, ProtocolError
         If the drive refuses something it must have.
     """
-    node, options = axis.node, axis.options
-    axis.units = _units(node, options, axis.index)
+    objects, options = axis.node.objects, axis.options
+    axis.units = _units(objects, options, axis.index)
     axis.speed_units = abs(axis.units) if options.speed_units is None else options.speed_units / tau
     axis.acceleration_units = (
         abs(axis.units) if options.acceleration_units is None else options.acceleration_units / tau
     )
-    watch_host(node)
-    node.write(0x6007, 0, _FAULT, verify=True)
-    _try(node, 0x605E, 0, _QUICK_STOP_RAMP)
-    _try(node, 0x605A, 0, options.quick_stop)
-    _try(node, 0x607C, 0, round(options.home_offset[axis.index] * axis.units))
+    watch_host(objects)
+    objects.write(0x6007, 0, _FAULT, verify=True)
+    _try(objects, 0x605E, 0, _QUICK_STOP_RAMP)
+    _try(objects, 0x605A, 0, options.quick_stop)
+    _try(objects, 0x607C, 0, round(options.home_offset[axis.index] * axis.units))
     if options.homing_method is not None:
-        node.write(0x6098, 0, options.homing_method, verify=True)
+        objects.write(0x6098, 0, options.homing_method, verify=True)
     for subindex, speed in ((1, options.home_speed), (2, options.home_creep)):
         if speed is not None:
-            node.write(0x6099, subindex, max(1, round(speed * axis.speed_units)), verify=True)
+            objects.write(0x6099, subindex, max(1, round(speed * axis.speed_units)), verify=True)
     if options.acceleration is not None:
         acceleration = max(1, round(options.acceleration * axis.acceleration_units))
-        node.write(0x6083, 0, acceleration, verify=True)
-        _try(node, 0x6084, 0, acceleration)
-    node.write(0x1017, 0, HEARTBEAT_MS, verify=True)
+        objects.write(0x6083, 0, acceleration, verify=True)
+        _try(objects, 0x6084, 0, acceleration)
+    objects.write(0x1017, 0, HEARTBEAT_MS, verify=True)
 
 
-def watch_host(node: Node) -> None:
+def watch_host(objects: Objects) -> None:
     """Let the drive watch the host's heartbeat, for at most 300 ms."""
-    watched = node.read(0x1016, 1)
+    watched = objects.read(0x1016, 1)
     period_ms = watched & 0xFFFF
     if not _FASTEST_WATCHDOG_MS <= period_ms <= _SLOWEST_WATCHDOG_MS:
         period_ms = _WATCHDOG_MS
     if watched != HOST_NODE << 16 | period_ms:
-        node.write(0x1016, 1, HOST_NODE << 16 | period_ms, verify=True)
+        objects.write(0x1016, 1, HOST_NODE << 16 | period_ms, verify=True)
 
 
 def map_pdos(axis: Axis) -> None:
     """Give the drive the PDOs of ``docs/canopen.md``; one of the market has no device time to send."""
-    node = axis.node
-    remote = node.remote
+    objects, remote = axis.node.objects, axis.node.remote
     if axis.ours:
-        _save(node, remote.rpdo[2])
+        _save(objects, remote.rpdo[2])
     else:
         axis.use_plain_time()
-    _save(node, remote.rpdo[1])
+    _save(objects, remote.rpdo[1])
     for pdo in (remote.tpdo[1], remote.tpdo[2]):
-        _save(node, pdo, None if axis.ours else STATUS_PERIOD_MS)  # ours have a status period of their own
+        _save(objects, pdo, None if axis.ours else STATUS_PERIOD_MS)  # ours have a status period of their own
 
 
 def limits_of(axis: Axis, own: StageLimits | None) -> AxisLimits:
@@ -134,16 +134,16 @@ def limits_of(axis: Axis, own: StageLimits | None) -> AxisLimits:
     ProtocolError
         If neither the drive nor the host has limits.
     """
-    node = axis.node
+    objects = axis.node.objects
     asked = (-float("inf"), float("inf")) if own is None else _own_limits(own, axis.index)
     lowest, highest = _soft_limits(axis, asked)
     if not (lowest > -float("inf") and highest < float("inf")):
         name = AXIS_NAMES[axis.index]
-        raise ProtocolError(f"{node.name} has no soft limits: give {name}_min_deg and {name}_max_deg")
+        raise ProtocolError(f"{axis.name} has no soft limits: give {name}_min_deg and {name}_max_deg")
     if lowest > highest:
         raise ValueError("the limits asked for leave the stage nowhere to go within its own")
-    speed_units = node.read_optional(0x607F) or node.read(0x6081)
-    acceleration_units = min(node.read(0x6083), node.read_optional(0x6084) or node.read(0x6083))
+    speed_units = objects.read_optional(0x607F) or objects.read(0x6081)
+    acceleration_units = min(objects.read(0x6083), objects.read_optional(0x6084) or objects.read(0x6083))
     speed = speed_units / axis.speed_units
     return AxisLimits(
         lowest,
@@ -155,8 +155,8 @@ def limits_of(axis: Axis, own: StageLimits | None) -> AxisLimits:
 
 def _soft_limits(axis: Axis, asked: tuple[float, float]) -> tuple[float, float]:
     """Return the narrower of the limits asked for and the drive's, in rad, once the drive has them too."""
-    node, units = axis.node, axis.units
-    low, high = node.read_optional(0x607D, 1), node.read_optional(0x607D, 2)
+    objects, units = axis.node.objects, axis.units
+    low, high = objects.read_optional(0x607D, 1), objects.read_optional(0x607D, 2)
     if low is None or high is None:
         return asked
     if low == high == 0:  # that of many a drive for none
@@ -168,8 +168,8 @@ def _soft_limits(axis: Axis, asked: tuple[float, float]) -> tuple[float, float]:
     if both[0] <= both[1] and both != told:
         edges = sorted(min(max(round(edge * units), low), high) for edge in both if abs(edge) != float("inf"))
         if len(edges) == 2:
-            node.write(0x607D, 1, edges[0], verify=True)
-            node.write(0x607D, 2, edges[1], verify=True)
+            objects.write(0x607D, 1, edges[0], verify=True)
+            objects.write(0x607D, 2, edges[1], verify=True)
     return both
 
 
@@ -177,35 +177,35 @@ def _own_limits(own: StageLimits, index: int) -> tuple[float, float]:
     return (own.elevation_min, own.elevation_max) if index else (own.azimuth_min, own.azimuth_max)
 
 
-def _units(node: Node, options: DriveOptions, index: int) -> float:
+def _units(objects: Objects, options: DriveOptions, index: int) -> float:
     """Return a drive's position units per rad: the option's, or those of its encoder and gear."""
     told = options.units_per_turn[index]
     if told is not None:
         return told / tau
-    increments, turns = node.read_optional(0x608F, 1), node.read_optional(0x608F, 2)
+    increments, turns = objects.read_optional(0x608F, 1), objects.read_optional(0x608F, 2)
     if not increments or not turns:
-        raise ProtocolError(f"{node.name} does not tell its units: give {AXIS_NAMES[index]}_units_per_turn")
+        raise ProtocolError(f"{objects.name} does not tell its units: give {AXIS_NAMES[index]}_units_per_turn")
     return increments / turns / tau
 
 
-def _save(node: Node, pdo: canopen.pdo.PdoMap, period_ms: int | None = None) -> None:
+def _save(objects: Objects, pdo: canopen.pdo.PdoMap, period_ms: int | None = None) -> None:
     """Write a PDO's mapping as it stands, sent on each event and at least each so many ms."""
     pdo.enabled, pdo.trans_type, pdo.event_timer = True, 255, period_ms
     pdo.inhibit_time = pdo.sync_start_value = None
-    node.save(pdo)
+    objects.save(pdo)
 
 
-def _try(node: Node, index: int, subindex: int, value: int) -> None:
+def _try(objects: Objects, index: int, subindex: int, value: int) -> None:
     """Write what a drive need not have."""
     try:
-        node.write(index, subindex, value, verify=True)
+        objects.write(index, subindex, value, verify=True)
     except MissingObjectError:
         if value and index == 0x607C:
-            raise DeviceFaultError(f"{node.name} has no home offset: leave it out") from None
+            raise DeviceFaultError(f"{objects.name} has no home offset: leave it out") from None
 
 
-def _text(node: Node, index: int) -> str:
+def _text(objects: Objects, index: int) -> str:
     try:
-        return node.read_text(index)
+        return objects.read_text(index)
     except MissingObjectError:
         return ""
