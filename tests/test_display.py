@@ -16,6 +16,7 @@ from drivers.transport.virtual import VirtualClock
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.cli.display import REFRESH_PERIOD, DisplayContext
 from northfinder.cli.live_view import LiveView
+from northfinder.cli.show import print_result
 from northfinder.cyclogram import Step
 from northfinder.estimation import Fix
 from northfinder.measurement import Measurement, measure
@@ -40,10 +41,10 @@ def dwell(n_done: int, fraction: float, *, now: float = 0.0, name: str | None = 
     )  # fmt: skip
 
 
-def drawn(view: LiveView, progress: Progress, now: float = 0.0) -> str:
+def drawn(view: LiveView, progress: Progress, now: float = 0.0, width: int = 100) -> str:
     """Return the picture as text."""
-    console = Console(file=io.StringIO(), width=100, force_terminal=False)
-    console.print(view.picture(progress, now))
+    console = Console(file=io.StringIO(), width=width, force_terminal=False)
+    console.print(view.picture(progress, now, width))
     text = console.file.getvalue()  # type: ignore[attr-defined]  # it is the StringIO from above
     return str(text)
 
@@ -109,6 +110,34 @@ def test_names_of_steps_are_printable() -> None:
     progress = dwell(0, 0.5, name="\x1b]52;c;AAAA\x07")
     view.note(progress, None, 0.0)
     assert not set(drawn(view, progress)) & {"\x1b", "\u202e", "\x07"}
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_nothing_is_cut_on_any_terminal(width: int) -> None:
+    """Every step and every word is there, no line is broken between a step and its mark, and ^C fits beside it."""
+    names = ("U1", "U2", "U3", "west", "east", "west", "up", "down", "north", "south")
+    view, progress = LiveView(lambda: names), dwell(2, 0.5, name="U3", n_samples=123_456, stage=stage(0.0))
+    view.note(progress, None, 0.0)
+    lines = drawn(view, progress, width=width).splitlines()
+    assert all(len(line) <= width - len("^C") for line in lines)
+    rows = [line.strip("│╭╮╰╯─ ") for line in lines]
+    text = " ".join(" ".join(rows).split())
+    assert "✓ U1 ✓ U2 ▶ U3 · west · east · west · up · down · north · south" in text
+    assert not any(row.endswith("·") for row in rows)
+    for whole in ("stage heard 0.0 s ago", "elevation 0.000 deg, idle", "123,456 samples, the disk keeps up"):
+        assert whole in text
+
+
+def test_a_long_plan_shows_what_is_about_the_present() -> None:
+    """A hundred steps are not a hundred lines, and the current one is among those shown."""
+    names = [f"s{number}" for number in range(100)]
+    view = LiveView(lambda: names)
+    for at in (0, 50, 99):
+        progress = dwell(at, 0.5, name=names[at])
+        view.note(progress, None, 0.0)
+        text = drawn(view, progress, width=60)
+        assert f"▶ s{at}" in text
+        assert len(text.splitlines()) <= 16
 
 
 #: How much slower time passes for the screen than on the bench: fewer pictures show the same.
@@ -180,7 +209,15 @@ def test_a_measurement_without_a_terminal(capsys: pytest.CaptureFixture[str], tm
     lines = shown.err.splitlines()
     assert lines[0] == "connect"
     assert sum(line.startswith("dwell ") for line in lines) >= 5
-    assert re.search(r"azimuth \d+\.\d+ ± ", lines[-2])
+    assert re.search(r"azimuth \d+\.\d+ ± \d+\.\d+ deg \(95 %\)", lines[-2])
+
+
+def test_a_terminal_that_cannot_place_its_cursor_gets_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    """TERM=dumb: a picture would never be drawn, so the lines are."""
+    console = Console(file=io.StringIO(), force_terminal=True, _environ={"TERM": "dumb"})
+    with DisplayContext(VirtualClock(), quiet=False, console=console) as display:
+        display.show(Progress(state=State.CONNECT), None)
+    assert capsys.readouterr().err == "connect\n"
 
 
 def test_a_quiet_measurement(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -203,3 +240,35 @@ def test_a_view_of_several_measurements_begins_anew(tmp_path: Path) -> None:
 
 def _some_fix(folder: Path) -> Fix:
     return Screen(folder, terminal=True, quiet=True).outcome.fix
+
+
+RESULT: dict[str, Any] = {
+    "azimuth_deg": 359.99996, "azimuth_sd_deg": 0.107, "latitude_deg": -0.0001, "latitude_sd_deg": 0.116,
+    "bias_dph": [-0.0001, 38.2], "scale_factor": None, "n_rejected": 0, "rescaled_by": 1.0,
+    "checks": [
+        {"passed": True, "decisive": True, "sentence": "the first holds"},
+        {"passed": False, "decisive": False, "sentence": "the second does not"},
+        {"passed": False, "decisive": True, "sentence": "the third does not"},
+    ],
+    "notes": ["note [/bold] of \x1b a file"], "record": "records [red]/a[/red].sqlite",
+}  # fmt: skip
+
+
+def test_a_result_is_said_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    """Brackets in a path are no markup, directions end below 360, nothing is minus zero, each ± is explained."""
+    print_result(RESULT)
+    text = " ".join(capsys.readouterr().out.split())
+    assert "records [red]/a[/red].sqlite" in text
+    assert "note [/bold] of ? a file" in text
+    assert "azimuth 0.000 ± 0.107 deg" in text
+    assert "latitude 0.000 ± 0.116 deg" in text
+    assert "bias 0.000, 38.200 deg/h" in text
+    assert "each ± is one standard deviation" in text
+
+
+def test_a_warning_is_no_failure(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only a decisive check fails, in the words of the report."""
+    print_result(RESULT)
+    text = capsys.readouterr().out
+    for verdict, sentence in (("pass", "first holds"), ("warning", "second does not"), ("FAIL", "third does not")):
+        assert re.search(rf"│ {verdict} +the {sentence}", text)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 
 from drivers.api import Clock
-from northfinder.cli.live_view import LiveView, countdown
+from northfinder.cli.live_view import LiveView, azimuth_text, countdown
 from northfinder.estimation import Fix
 from northfinder.sequencer import Progress, State
 from northfinder.text import printable
@@ -47,11 +47,11 @@ class LiveDisplay:
         self._view.note(progress, fix, now)
         if now >= self._next:
             self._next = now + REFRESH_PERIOD
-            self._live.update(self._view.picture(progress, now), refresh=True)
+            self._live.update(self._view.picture(progress, now, self._live.console.width), refresh=True)
 
     def say(self, text: str) -> None:
         """Print it above the picture."""
-        self._live.console.print(text)
+        self._live.console.print(text, markup=False, highlight=False)
 
 
 class PlainDisplay:
@@ -71,7 +71,7 @@ class PlainDisplay:
             line = (
                 f"dwell {progress.n_done + 1} at {printable(progress.step.name)}, {countdown(progress.remaining)} to go"
             )
-            line += "" if fix is None else f", azimuth {azimuth_text(fix)}"
+            line += "" if fix is None else f", azimuth {azimuth_text(fix)} (95 %)"
         print(line, file=sys.stderr, flush=True)  # noqa: T201  # what it is for
 
     def say(self, text: str) -> None:
@@ -112,7 +112,8 @@ class DisplayContext(AbstractContextManager[Display]):
         `step_names` tells the plan's steps, `time` how long it may take, s; `console` is standard error by default.
         """
         console = console or Console(stderr=True)
-        live = console.is_terminal and not quiet
+        # A dumb terminal cannot draw in place: it would show nothing at all.
+        live = console.is_terminal and not console.is_dumb_terminal and not quiet
         self._live = _live(console) if live else None
         self._context: AbstractContextManager[object] = self._live or nullcontext()
         self._display: Display = SilentDisplay() if quiet else PlainDisplay()
@@ -127,8 +128,3 @@ class DisplayContext(AbstractContextManager[Display]):
     def __exit__(self, *failure: object) -> None:
         """Take the display down."""
         self._context.__exit__(*failure)  # type: ignore[arg-type]  # handed through unread
-
-
-def azimuth_text(fix: Fix) -> str:
-    """Return the azimuth as an operator reads it."""
-    return f"{math.degrees(fix.azimuth):.3f} ± {math.degrees(fix.azimuth_sd):.3f} deg"

@@ -13,6 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from northfinder.angles import decimals_for, direction_text
 from northfinder.estimation import Fix
 from northfinder.sequencer import Progress, State
 from northfinder.text import printable
@@ -21,6 +22,11 @@ from northfinder.units import DPH
 _BARS = "▁▂▃▄▅▆▇█"
 #: Means of a batch of samples in the sparkline, and intervals in the trail.
 _N_RATES, _N_INTERVALS = 48, 6
+#: Columns of what stands beside the names, and of all that surrounds it. Two more are left free, for the ^C that a
+#: terminal adds to the last line: on a line of its own it would leave a remnant of the picture behind.
+_WIDEST, _NARROWEST, _FRAME = 66, 15, 13 + 2
+#: Lines of the plan that are shown at once.
+_PLAN_LINES = 4
 #: Characters to either side of the azimuth in its interval.
 _HALF_WIDTH = 14
 #: Host time over which samples are counted, s.
@@ -88,23 +94,25 @@ class LiveView:
         turning = progress.stage.device_time - self._begun - self._dwelt - in_dwell
         return progress.remaining + to_come * max(0.0, turning) / n_turned
 
-    def picture(self, progress: Progress, now: float) -> RenderableType:
-        """Return the picture of `progress` at host time `now`."""
+    def picture(self, progress: Progress, now: float, width: int = 80) -> RenderableType:
+        """Return the picture of `progress` at host time `now`, on a terminal of `width` columns."""
+        width = max(_NARROWEST, min(_WIDEST, width - _FRAME))
         table = Table.grid(padding=(0, 2))
         table.add_column(style="dim", no_wrap=True)
-        table.add_column(overflow="fold", min_width=66)
+        table.add_column(overflow="fold", width=width)
         # A plan may take its steps in mirrored order: those taken are named as they were.
         names = [self._taken.get(number, name) for number, name in enumerate(self._step_names())]
         if names:
-            table.add_row("plan", _plan(names, progress))
+            table.add_row("plan", _plan(names, progress, width))
         table.add_row("now", _now(progress))
         if progress.state is State.DWELL:
             table.add_row("", ProgressBar(total=1.0, completed=progress.step_fraction, width=40))
         if progress.n_steps:
             table.add_row("to go", Text(f"about {countdown(self.to_go(progress))} to the end", style="bold"))
         if self._rates:
-            table.add_row("rate", f"{self._rates[-1]:+9.2f} deg/h  {sparkline(self._rates)}")
-        table.add_row("azimuth", self._azimuth())
+            said = f"{self._rates[-1]:+9.2f} deg/h  "
+            table.add_row("rate", said + sparkline(list(self._rates)[-max(1, width - len(said)) :]))
+        table.add_row("azimuth", self._azimuth(width))
         if progress.stage is not None:
             angles = (math.degrees(angle) for angle in (progress.stage.azimuth, progress.stage.elevation))
             table.add_row("stage", "azimuth {:.3f}, elevation {:.3f} deg, ".format(*angles) + progress.stage.mode.value)
@@ -112,12 +120,15 @@ class LiveView:
         table.add_row("record", _record(progress))
         return Panel(table, title="north-finder", box=ROUNDED, expand=False)
 
-    def _azimuth(self) -> Text:
+    def _azimuth(self, width: int) -> Text:
         if self._fix is None:
             return Text("not yet known", style="dim")
         half = self._intervals[-1]
-        text = Text(f"{math.degrees(self._fix.azimuth):.2f} ± {half:.2g} deg", style="bold")
-        text.append(" (95 %)  " + interval(half, max(self._intervals)), style="cyan not bold")
+        text = Text(azimuth_text(self._fix), style="bold")
+        text.append(" (95 %)", style="cyan not bold")
+        drawn = "  " + interval(half, max(self._intervals))
+        if len(text) + len(drawn) <= width:
+            text.append(drawn, style="cyan not bold")
         if len(self._intervals) > 1:
             trail = " › ".join(f"{each:.2g}" for each in self._intervals)
             text.append(f"\n± {trail}", style="dim not bold")
@@ -135,15 +146,19 @@ class LiveView:
         return text
 
 
-def _plan(names: Sequence[str], progress: Progress) -> Text:
-    """Return all steps: done, current and coming."""
-    text = Text()
+def _plan(names: Sequence[str], progress: Progress, width: int) -> Text:
+    """Return the steps done, current and coming; of a long plan the lines about the current one."""
+    lines, at = [Text()], 0
     for number, name in enumerate(names):
         done, current = number < progress.n_done, number == progress.n_done and progress.state in _IN_STEPS
         mark, style = ("✓", "green") if done else ("▶", "bold") if current else ("·", "dim")
-        text.append(f"{mark} {printable(name, max_length=20)}", style=style)
-        text.append("  ")
-    return text
+        step = Text(f"{mark} {printable(name, max_length=20)}", style=style)
+        if lines[-1] and lines[-1].cell_len + len("  ") + step.cell_len > width:
+            lines.append(Text())
+        lines[-1].append_text(Text("  " if lines[-1] else "") + step)
+        at = len(lines) - 1 if number <= progress.n_done else at
+    first = max(0, min(at - 1, len(lines) - _PLAN_LINES))
+    return Text("\n").join(lines[first : first + _PLAN_LINES])
 
 
 def _now(progress: Progress) -> str:
@@ -190,3 +205,10 @@ def countdown(seconds: float) -> str:
     """
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes}:{rest:02d}"
+
+
+def azimuth_text(fix: Fix) -> str:
+    """Return the azimuth and half its 95 % interval."""
+    half = math.degrees(fix.coverage_factor() * fix.azimuth_sd)
+    decimals = decimals_for(half)
+    return f"{direction_text(math.degrees(fix.azimuth), decimals)} ± {half:.{decimals}f} deg"

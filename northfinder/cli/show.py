@@ -10,10 +10,15 @@ import msgspec
 from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
+from rich.text import Text
 
+from northfinder.angles import direction_text
 from northfinder.budget_report import largest
 from northfinder.errors import EstimateError
 from northfinder.text import printable
+
+#: A note longer than this is cut.
+_MAX_NOTE = 500
 
 
 def print_json(value: object) -> None:
@@ -25,39 +30,51 @@ def print_json(value: object) -> None:
 def print_result(result: Mapping[str, Any], *, truth: tuple[float, float] | None = None) -> None:
     """Print a fix as a panel; `truth` is the emulator's (azimuth, latitude) in deg."""
     table = Table.grid(padding=(0, 2))
-    table.add_row("azimuth", f"[bold]{_with_sd(result['azimuth_deg'], result['azimuth_sd_deg'])}[/bold]")
-    table.add_row("latitude", _latitude(result))
-    for row in _bearings(result):
-        table.add_row(*row)
+    for label, value in _rows(result, truth):
+        # As texts: what a file or a device says is no markup.
+        table.add_row(label, value if isinstance(value, Text) else Text(value))
+    panel = Panel(table, title="true north", subtitle="each ± is one standard deviation", expand=False)
+    Console().print(panel)
+
+
+def _rows(result: Mapping[str, Any], truth: tuple[float, float] | None) -> Iterator[tuple[str | Text, str | Text]]:
+    """Yield what the panel says, as (label, value)."""
+    yield "azimuth", _bold(_direction(result["azimuth_deg"], result["azimuth_sd_deg"]))
+    yield "latitude", _latitude(result)
+    yield from _bearings(result)
     if truth is not None:
-        table.add_row("truth", f"azimuth {truth[0]:g} deg, latitude {truth[1]:g} deg, in the emulator")
+        yield "truth", f"azimuth {truth[0]:g} deg, latitude {truth[1]:g} deg, in the emulator"
     biases = result["bias_dph"] if isinstance(result["bias_dph"], list) else [result["bias_dph"]]
-    table.add_row("bias", ", ".join(f"{bias:.3f}" for bias in biases) + " deg/h")
+    yield "bias", ", ".join(f"{bias:z.3f}" for bias in biases) + " deg/h"
     if result["scale_factor"] is not None:
-        table.add_row("scale factor", f"{result['scale_factor']:.4f} ± {result['scale_factor_sd']:.4f}")
-    for row in _notes(result):
-        table.add_row(*row)
+        yield "scale factor", f"{result['scale_factor']:.4f} ± {result['scale_factor_sd']:.4f}"
+    yield from _notes(result)
     for check in result["checks"]:
-        mark = "[green]pass[/green]" if check["passed"] else "[red]FAIL[/red]"
-        table.add_row(mark, printable(check["sentence"]))
+        yield _verdict(check), printable(check["sentence"])
     if "n_samples" in result:
-        table.add_row("samples", f"{result['n_samples']} in {result['duration_s']:.1f} s, {result['n_lost']} lost")
+        yield "samples", f"{result['n_samples']:,} in {result['duration_s']:.1f} s, {result['n_lost']:,} lost"
     if "record" in result:
         if not result.get("complete", True):
-            table.add_row("record", f"[red]ends before the measurement did, {result['steps']}[/red]")
-        table.add_row("record", printable(result["record"]))
-    Console().print(Panel(table, title="true north", expand=False))
+            yield "record", Text(f"ends before the measurement did, {result['steps']}", style="red")
+        yield "record", printable(result["record"])
 
 
-def _latitude(result: Mapping[str, Any]) -> str:
+def _verdict(check: Mapping[str, Any]) -> Text:
+    """Return the outcome of a check; one that is not decisive warns."""
+    if check["passed"]:
+        return Text("pass", style="green")
+    return Text("FAIL", style="red") if check["decisive"] else Text("warning", style="yellow")
+
+
+def _latitude(result: Mapping[str, Any]) -> str | Text:
     if result["latitude_deg"] is None:
         return f"not measured: {result['latitude_reason']}"
     if result["latitude_sd_deg"] == 0:
-        return f"{result['latitude_deg']:.3f} deg, as given"
-    return f"[bold]{_with_sd(result['latitude_deg'], result['latitude_sd_deg'])}[/bold]"
+        return f"{result['latitude_deg']:z.3f} deg, as given"
+    return _bold(_with_sd(result["latitude_deg"], result["latitude_sd_deg"]))
 
 
-def _bearings(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _bearings(result: Mapping[str, Any]) -> Iterator[tuple[str, str | Text]]:
     """Yield what the azimuth is on a map and by a compass, or why it is not known, where a position was given."""
     if "position" not in result:
         return
@@ -65,12 +82,12 @@ def _bearings(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if "reason" in grid:
         yield "grid azimuth", f"none: {printable(grid['reason'])}"
     else:
-        yield "grid azimuth", f"[bold]{_with_sd(grid['azimuth_deg'], grid['azimuth_sd_deg'])}[/bold]"
-        yield "", f"convergence {grid['convergence_deg']:.4f} deg, {printable(grid['name'])} (EPSG:{grid['epsg']})"
+        yield "grid azimuth", _bold(_direction(grid["azimuth_deg"], grid["azimuth_sd_deg"]))
+        yield "", f"convergence {grid['convergence_deg']:z.4f} deg, {printable(grid['name'])} (EPSG:{grid['epsg']})"
     if "reason" in magnetic:
         yield "magnetic", f"none: {printable(magnetic['reason'])}"
         return
-    yield "magnetic", f"[bold]{_with_sd(magnetic['bearing_deg'], magnetic['bearing_sd_deg'])}[/bold]"
+    yield "magnetic", _bold(_direction(magnetic["bearing_deg"], magnetic["bearing_sd_deg"]))
     declination = _with_sd(magnetic["declination_deg"], magnetic["declination_sd_deg"])
     yield "", f"declination {declination} on {magnetic['date']}"
     yield "", f"by {magnetic['model']}, which holds from {magnetic['valid_from']} to {magnetic['valid_until']}"
@@ -92,7 +109,7 @@ def _notes(result: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         applied = result["calibration"]
         yield "calibration", f"of {applied['date']}, valid until {applied['valid_until']}: {applied['model']}"
     for note in result.get("notes", []):
-        yield "note", note
+        yield "note", printable(note, max_length=_MAX_NOTE)
 
 
 def require_trustworthy(result: Mapping[str, Any]) -> None:
@@ -103,5 +120,13 @@ def require_trustworthy(result: Mapping[str, Any]) -> None:
         raise EstimateError(f"no trustworthy estimate: {failed[0]}")
 
 
+def _bold(text: str) -> Text:
+    return Text(text, style="bold")
+
+
+def _direction(angle_deg: float, sd_deg: float) -> str:
+    return f"{direction_text(angle_deg, 3)} ± {sd_deg:.3f} deg"
+
+
 def _with_sd(value: float, sd: float) -> str:
-    return f"{value:.3f} ± {sd:.3f} deg"
+    return f"{value:z.3f} ± {sd:.3f} deg"
