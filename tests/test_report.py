@@ -10,8 +10,11 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +22,10 @@ from click.testing import CliRunner, Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from long_record import write_record
-from look import HOSTILE, HOSTILE_NAME, browser
+from look import HOSTILE, HOSTILE_NAME, Chromium, browser
+from look import measure as look_measure
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from virtual import Unwatched, assume, virtual_bench
 
 from drivers.api import DeviceIdentity
@@ -32,12 +38,15 @@ from northfinder.geodesy import Place
 from northfinder.measurement import Measurement, measure
 from northfinder.record.schema import INSERT, NAMES, sealed
 from northfinder.report.axes import Axis
-from northfinder.report.charts import broken, charts, dwell_pairs, pooled_allan
+from northfinder.report.campaign import of_the_mean
+from northfinder.report.charts import Line, Mark, broken, charts, dwell_pairs, pooled_allan
 from northfinder.report.compass import rose
-from northfinder.report.content import azimuth_figure, other_figures, standing
+from northfinder.report.content import azimuth_figure, budget_lines, method_rows, other_figures, standing
 from northfinder.report.document import record_json, record_markdown
+from northfinder.report.figures import report_style
 from northfinder.report.gather import RecordReport, gather_record
 from northfinder.report.page import record_page
+from northfinder.report.paper import record_pages
 from northfinder.report.series import Envelope, thinned
 from northfinder.solve_file import solve_record
 
@@ -217,9 +226,7 @@ def test_the_pooled_allan_deviation_of_one_run_is_the_usual_one() -> None:
 def test_the_report_gives_the_fix_of_solve(report: RecordReport, emulated: Path) -> None:
     """To the last bit, with the bearings of the position given."""
     solved = solve_record(emulated, place=Place.of("50.429,30.523,170", None))
-    assert {key: report.result[key] for key in solved if key != "plan"} == {
-        key: value for key, value in solved.items() if key != "plan"
-    }
+    assert report.result == solved
     assert "grid" in report.result
 
 
@@ -258,6 +265,61 @@ def test_the_stage_is_drawn_in_the_time_of_the_samples(report: RecordReport) -> 
         for drawn, measured in ((report.stage.azimuth, dwell.span.measured_azimuth),
                                 (report.stage.elevation, dwell.span.measured_elevation)):  # fmt: skip
             assert np.interp(middle, report.stage.time, drawn) == pytest.approx(measured, abs=1e-6)
+
+
+def test_what_adds_nothing_to_the_uncertainty_has_no_bar(report: RecordReport) -> None:
+    """It is named instead; the bars add up, in quadrature, to what is stated."""
+    lines, idle = budget_lines(report)
+    shares = [0.0 if line.azimuth == "none" else float(line.azimuth.rstrip("°")) for line in lines]
+    assert math.hypot(*shares) == pytest.approx(report.result["azimuth_sd_deg"], abs=1e-4 * len(lines))
+    assert all(line.azimuth != "none" or line.latitude != "none" for line in lines)
+    budget = [dict(line) for line in report.result["budget"]]
+    budget[0] |= {"azimuth_deg": 0.0, "latitude_deg": 1e-12}
+    budget[1] |= {"azimuth_deg": 3e-5}
+    others, more = budget_lines(replace(report, result=report.result | {"budget": budget}))
+    assert [line.quantity for line in others] == [line.quantity for line in lines[1:]]
+    assert others[0].azimuth == "< 0.0001°"
+    assert more == [f"Without effect on this measurement: {lines[0].quantity}.", *idle]
+
+
+def test_published_formulas_stand_with_their_intervals(report: RecordReport) -> None:
+    """They differ from the fix, and a reader must see that they may."""
+    said = dict(method_rows(report))["published formulas"]
+    closed = report.result["closed_form"]
+    assert f"azimuth {closed['azimuth_deg']:.3f}° ± {1.959964 * closed['azimuth_sd_deg']:.3f}° by (2)" in said
+    assert f"± {1.959964 * closed['latitude_sd_deg']:.3f}° by (3)" in said
+
+
+def test_dwells_are_named_where_there_is_room(report: RecordReport) -> None:
+    """By name if they are few, else by number, as they are drawn below; a long name in a short dwell not at all."""
+    assert [mark.name for mark in _rate_marks(report)] == ["U1", "U2", "U3", "U4", "U1", "U5", "U6", "U1"]
+    many = replace(report, dwells=report.dwells * 2)
+    assert [mark.name for mark in _rate_marks(many)] == [str(number) for number in range(1, 17)]
+    first = report.dwells[0]
+    renamed = replace(first, span=replace(first.span, name="a name of forty letters, more or less so"))
+    assert _rate_marks(replace(report, dwells=(renamed, *report.dwells[1:])))[0].name == ""
+
+
+def _rate_marks(report: RecordReport) -> tuple[Mark, ...]:
+    return next(chart.marks for chart in charts(report) if chart.name == "rate")
+
+
+def test_tilt_and_temperature_are_not_drawn_between_dwells(axes: Path) -> None:
+    """Nothing was measured there: the line is broken, and no point of it lies outside of a dwell."""
+    report = gather_record(axes)
+    report = replace(report, dwells=report.dwells[:5])
+    line = next(chart.items[0] for chart in charts(report) if chart.name == "temperature")
+    assert isinstance(line, Line)
+    last = report.dwells[-1].stop / 60.0
+    drawn = line.x[line.x <= last]
+    assert all(any(d.start / 60.0 <= x <= d.stop / 60.0 for d in report.dwells) for x in drawn)
+    assert np.isnan(line.x).sum() == 4
+
+
+def test_angles_have_ticks_at_parts_of_a_circle() -> None:
+    """A stage that turns once around has ticks each quarter; a small angle has decimal ones."""
+    assert [text for _, text in Axis(-10.0, 370.0, angles=True).ticks()] == ["0", "90", "180", "270", "360"]
+    assert [text for _, text in Axis(-0.1, 0.11, angles=True).ticks()] == ["−0.10", "−0.05", "0.00", "0.05", "0.10"]
 
 
 # The page
@@ -327,7 +389,7 @@ def test_any_name_is_shown_or_replaced(name: str) -> None:
     from northfinder.text import printable  # noqa: PLC0415
 
     given_names = {
-        "title": "t", "value": "", "scatter": "", "facts": [("gyro", printable(name))], "plots": [],
+        "title": "t", "value": "", "interval": "", "basis": "", "facts": [("gyro", printable(name))], "plots": [],
         "scatter_head": [], "scatter_rows": [], "judged_head": [], "judged_rows": [], "record_head": [],
         "record_rows": [[printable(name)]], "version": "",
     }  # fmt: skip
@@ -335,6 +397,34 @@ def test_any_name_is_shown_or_replaced(name: str) -> None:
     plain = Page(render("campaign.html", **(given_names | {"facts": [("gyro", "x")], "record_rows": [["x"]]})))
     assert page.elements == plain.elements
     assert all(character.isprintable() or character == "\n" for text in page.texts for character in text)
+
+
+def test_colours_stand_out_in_every_scheme() -> None:
+    """As WCAG 2 asks, AA: texts 4.5 to 1 from what they stand on, lines and bars 3 to 1; light, dark and printed."""
+    style = (resources.files("northfinder.report") / "templates" / "style.css").read_text(encoding="utf-8")
+    schemes = [
+        dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", each))
+        for each in re.findall(r":root \{(.*?)\}", style, re.DOTALL)
+    ]
+    assert len(schemes) == 3
+    for scheme in schemes:
+        for ground in ("paper", "sheet", "shade"):
+            for text in ("ink", "muted", "good", "bad", "warn"):
+                assert _contrast(scheme[text], scheme[ground]) >= 4.5, (text, ground)
+            for line in ("accent", "one", "two", "three", "faint", "model"):
+                assert _contrast(scheme[line], scheme[ground]) >= 3.0, (line, ground)
+
+
+def _contrast(one: str, other: str) -> float:
+    """Return the contrast ratio of WCAG 2."""
+    light, dark = sorted((_luminance(one), _luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def _luminance(colour: str) -> float:
+    parts = [int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+    red, green, blue = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def test_a_record_without_an_azimuth_has_a_report(early: Path) -> None:
@@ -465,6 +555,40 @@ def test_a_picture_of_one_part(emulated: Path, early: Path, tmp_path: Path) -> N
     assert "nothing to draw as --part allan" in str(done.exception)
 
 
+@pytest.mark.parametrize("name", ["emulated", "hostile", "early", "axes"])
+def test_nothing_leaves_the_paper(name: str, request: pytest.FixtureRequest) -> None:
+    """Every text lies on its page, whatever it is and however many there are; the last says which record it is."""
+    report = gather_record(request.getfixturevalue(name))
+    report = replace(report, events=tuple((IN_2026, "note", f"a lorry, {number}") for number in range(120)))
+    with report_style():
+        pages = record_pages(report)
+        for page in pages:
+            FigureCanvasAgg(page).draw()  # type: ignore[no-untyped-call]  # matplotlib's
+            width, height = page.bbox.size
+            for text in page.findobj(Text):
+                box = text.get_window_extent()
+                if text.get_text().strip() and text.get_visible():
+                    assert min(box.x0, box.y0) >= 0.0, text
+                    assert box.x1 <= width, text
+                    assert box.y1 <= height, text
+    said = [text.get_text() for page in pages for text in page.texts]
+    assert f"{name}.sqlite" in said[1:]
+    assert {"note: a lorry, 0", "note: a lorry, 119"} <= set(said)
+
+
+def test_a_legend_leaves_the_title_alone(axes: Path) -> None:
+    """Three axes have many names: they stand on a line of their own."""
+    with report_style():
+        figure = record_pages(gather_record(axes))[1]
+        FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]  # matplotlib's
+        axis = figure.axes[0]
+        legend = axis.get_legend()
+        assert legend is not None
+        assert len(legend.get_texts()) == 4
+        (title,) = [each for each in axis.findobj(Text) if each.get_text() == "Rate against time"]
+        assert not legend.get_window_extent().overlaps(title.get_window_extent())
+
+
 def test_no_record_is_ever_written_over(emulated: Path) -> None:
     """Neither the one that is read nor any other database."""
     before = emulated.read_bytes()
@@ -485,6 +609,38 @@ def test_the_report_of_a_campaign(folder: Path, emulated: Path, hostile: Path) -
         path = folder / f"campaign.{kind}"
         assert invoke("report", emulated, hostile, "-o", path).exit_code == 0
         assert path.read_text(encoding="utf-8").startswith(begins)
+
+
+def campaign_of(azimuths: list[float], turn_ons: list[int], probability: float | None) -> dict[str, Any]:
+    """Return what is needed of the result of a campaign."""
+    rows = [{"azimuth_deg": each % 360.0, "turn_on": own} for each, own in zip(azimuths, turn_ons, strict=True)]
+    mean = float(np.mean(azimuths)) % 360.0
+    return {"records": rows, "azimuth": {"all": {"mean_deg": mean}, "between_turn_ons_probability": probability}}
+
+
+def test_the_mean_of_a_campaign_has_its_interval() -> None:
+    """By Student's t, across north; measurements after one turn-on count once where turn-ons differ."""
+    azimuths = [359.9, 360.3, 359.8, 360.2]
+    half, words = of_the_mean(campaign_of(azimuths, [1, 1, 2, 2], 0.7))
+    assert half == pytest.approx(3.18245 * np.std(azimuths, ddof=1) / 2.0, rel=1e-5)
+    assert words == "4 measurements"
+    half, words = of_the_mean(campaign_of([10.0, 10.2, 20.0, 20.2, 30.0, 30.2], [1, 1, 2, 2, 3, 3], 1e-9))
+    assert half == pytest.approx(4.30265 * 10.0 / math.sqrt(3.0), rel=1e-5)
+    assert words == "3 turn-ons, which differ"
+
+
+@pytest.mark.campaign
+def test_a_page_is_measured_at_the_width_of_a_telephone(tmp_path: Path) -> None:
+    """What fits 500 px, the narrowest window of the browser itself, and not 390 is found."""
+    command = browser()
+    if command is None:
+        pytest.skip("no Chromium on this machine")
+    chromium = Chromium(command, tmp_path)
+    page = tmp_path / "page.html"
+    words = "<p>word</p>" * 30
+    page.write_text(f'<!doctype html><body><div style="width: 450px">{words}</div></body>', encoding="utf-8")
+    assert look_measure(chromium, page, 1280)[1] == []
+    assert "the page is wider than the window: 458 of 390" in look_measure(chromium, page, 390)[1]
 
 
 @pytest.mark.campaign

@@ -1,8 +1,8 @@
 """Look at reports in a real browser: ``python tools/look.py FOLDER``; needs Chromium, and pdftoppm for the paper.
 
-Makes the report of an emulated measurement, of one with hostile names and notes, of one that ends early, of three axes
-at 2,000 samples/s, and of a campaign; renders each at 1280 and 390 px, light and dark, and on A4; leaves the pictures
-in FOLDER, to be looked at; and fails if a page
+Makes the reports of emulated measurements: with hostile names and two hundred notes, of one that ends early, of three
+axes at 2,000 samples/s, of a triad without a stage, of one in the south that points north, and of a campaign; renders
+each at 1280 and 390 px, light and dark, and on A4; leaves the pictures in FOLDER, to be looked at; and fails if a page
 
 * asks for anything beyond itself, or says anything on the browser's console,
 * is wider than the window, or has texts that overlap, or that are cut.
@@ -70,11 +70,19 @@ for (let i = 0; i < texts.length; i++) for (let k = i + 1; k < texts.length; k++
 for (const each of document.querySelectorAll('.mark b')) if (each.scrollWidth > each.clientWidth + 1)
   found.push('cut: ' + each.textContent);
 if (document.title.includes('taken')) found.push('a script of the record has run');
-const out = document.createElement('pre');
-out.id = 'measured';
-out.textContent = JSON.stringify({texts: texts.length, found: [...new Set(found)]});
-document.body.append(out);
+const height = document.documentElement.scrollHeight;
+parent.postMessage(JSON.stringify({texts: texts.length, height, found: [...new Set(found)]}), '*');
 </script>
+"""
+#: Holds a page in a frame of a telephone's width: the browser's own window is never narrower than 500 px.
+FRAME = """<!doctype html>
+<meta charset="utf-8">
+<title>measured</title>
+<body style="margin: 0">
+<script>
+onmessage = (event) => { document.body.innerHTML = '<pre id="measured"></pre>'; measured.textContent = event.data; };
+</script>
+<iframe style="border: 0; width: WIDTHpx; height: 100px" srcdoc="PAGE"></iframe>
 """
 
 
@@ -89,30 +97,21 @@ def make_pages(folder: Path) -> dict[str, Path]:
     gyro = DeviceIdentity(kind="gyro", model=HOSTILE, serial_number=HOSTILE_NAME, firmware_version="\x00\n")
     meta = {"northfinder": HOSTILE, "plan": {"name": HOSTILE}, "config": {"gyro": {"address": HOSTILE}}}
     meta |= {"identities": {"gyro": gyro}}
+    events = [("note", HOSTILE), (HOSTILE_NAME, HOSTILE), *[("note", "a lorry passed")] * 210]
     write_record(records["hostile"], seconds=240.0, sample_rate=100.0, n_axes=1, n_dwells=6, identities={"gyro": gyro},
-                 meta=meta, events=[("note", HOSTILE), (HOSTILE_NAME, HOSTILE)])  # fmt: skip
+                 meta=meta, events=events)  # fmt: skip
     write_record(records["early"], seconds=40.0, sample_rate=100.0, n_axes=1, n_dwells=1)
     write_record(records["axes"], seconds=600.0, n_axes=3, n_dwells=60)
-    find = ["find", "--speed", "max", "--quiet", "--json", "--position", "50.429,30.523,170"]
-    run([*find, "--seed", "1", "--time", "960", "--out", str(folder / "find")])
-    run([*find[:-2], "--plan", "six-position", "--seed", "2", "--out", str(folder / "six")])
-    run(
-        [
-            *find[:-2],
-            "--seed",
-            "3",
-            "--time",
-            "120",
-            "--latitude",
-            "50.429",
-            "--repeat",
-            "4",
-            "--out",
-            str(folder / "many"),
-        ]
-    )
+    find = ["find", "--speed", "max", "--quiet", "--json", "--seed"]
+    placed = ["--position", "50.429,30.523,170"]
+    run([*find, "1", *placed, "--time", "960", "--out", str(folder / "find")])
+    run([*find, "2", "--plan", "six-position", "--out", str(folder / "six")])
+    run([*find, "3", "--time", "120", "--latitude", "50.429", "--repeat", "4", "--out", str(folder / "many")])
+    south = ["--sim-azimuth", "359.95", "--sim-latitude", "-65", "--position=-65,-64.26"]
+    run([*find, "4", *south, "--time", "300", "--out", str(folder / "south")])
+    run([*find, "5", *placed, "--plan", "two-position", "--out", str(folder / "triad")])
     sources = {name: [path] for name, path in records.items()}
-    sources |= {name: sorted((folder / name).glob("*.sqlite")) for name in ("find", "six", "many")}
+    sources |= {name: sorted((folder / name).glob("*.sqlite")) for name in ("find", "six", "many", "south", "triad")}
     pages = {}
     for name, paths in sources.items():
         pages[name] = folder / f"{name}.html"
@@ -167,18 +166,13 @@ class Chromium:
 def look(chromium: Chromium, name: str, page: Path, folder: Path) -> list[str]:
     """Render a page in all ways; return what is wrong with it."""
     wrong = []
-    measured = page.with_suffix(".measured.html")
-    text = page.read_text(encoding="utf-8")
-    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
-    measured.write_text(bare.replace("</body>", MEASURE + "</body>"), encoding="utf-8")
     for width in WIDTHS:
+        height, found = measure(chromium, page, width)
+        wrong += [f"{name} at {width} px: {each}" for each in found]
         for scheme, options in SCHEMES.items():
             shot = folder / f"{name}-{width}-{scheme}.png"
-            size = f"--window-size={width},{_height(chromium, measured, width)}"
-            _, said = chromium.open(page, *options, size, f"--screenshot={shot}")
+            _, said = chromium.open(page, *options, f"--window-size={width},{height}", f"--screenshot={shot}")
             wrong += [f"{name} at {width} px, {scheme}: {each}" for each in said]
-        dom, _ = chromium.open(measured, f"--window-size={width},2000", "--dump-dom")
-        wrong += [f"{name} at {width} px: {each}" for each in _measured(dom)]
     paper = folder / f"{name}.pdf"
     _, said = chromium.open(page, "--no-pdf-header-footer", f"--print-to-pdf={paper}")
     wrong += [f"{name} on paper: {each}" for each in said]
@@ -187,22 +181,22 @@ def look(chromium: Chromium, name: str, page: Path, folder: Path) -> list[str]:
     return wrong
 
 
-def _height(chromium: Chromium, measured: Path, width: int) -> int:
-    """Return how tall the page is at a width."""
-    probe = measured.with_suffix(".height.html")
-    script = "<script>document.body.innerHTML = 'height=' + document.documentElement.scrollHeight + ';'</script></body>"
-    probe.write_text(measured.read_text(encoding="utf-8").replace(MEASURE + "</body>", script), encoding="utf-8")
-    dom, _ = chromium.open(probe, f"--window-size={width},800", "--dump-dom")
-    found = re.search(r"height=(\d+);", dom)
-    return 4000 if found is None else int(found[1])
-
-
-def _measured(dom: str) -> list[str]:
+def measure(chromium: Chromium, page: Path, width: int) -> tuple[int, list[str]]:
+    """Return how tall a page is at a width, and what is wrong with its texts."""
+    text = page.read_text(encoding="utf-8")
+    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
+    framed = FRAME.replace("WIDTH", str(width)).replace(
+        "PAGE", html.escape(bare.replace("</body>", MEASURE + "</body>"))
+    )
+    measured = page.with_suffix(".measured.html")
+    measured.write_text(framed, encoding="utf-8")
+    dom, _ = chromium.open(measured, "--window-size=1400,800", "--dump-dom")
     found = re.search(r'<pre id="measured">(.*?)</pre>', dom, re.DOTALL)
     if found is None:
-        return ["it could not be measured"]
+        return 4000, ["it could not be measured"]
     result = json.loads(html.unescape(found[1]))
-    return [str(each) for each in result["found"]] if result["texts"] > 20 else ["it shows next to no text"]
+    told = [str(each) for each in result["found"]] if result["texts"] > 20 else ["it shows next to no text"]
+    return int(result["height"]), told
 
 
 def main() -> None:

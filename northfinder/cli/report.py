@@ -82,11 +82,15 @@ def _of_record(path: Path, place: Place | None, kind: Format, part: str) -> byte
     from northfinder.report.gather import gather_record  # noqa: PLC0415  # heavy, and only for one record
 
     report = gather_record(path, place)
-    if kind in {"svg", "png", "pdf"}:
+    if kind == "pdf":
+        from northfinder.report.paper import record_pdf  # noqa: PLC0415  # drawing is dear to import
+
+        return record_pdf(report)
+    if kind in {"svg", "png"}:
         from northfinder.report import figures  # noqa: PLC0415  # drawing is dear to import
 
         try:
-            return figures.record_pdf(report) if kind == "pdf" else figures.picture(report, part, kind)
+            return figures.picture(report, part, kind)
         except KeyError:
             raise RecordError(f"the record {path} has nothing to draw as --part {part}") from None
     from northfinder.report import document, page  # noqa: PLC0415  # only now it is known that they are needed

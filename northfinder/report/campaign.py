@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from northfinder.angles import direction_text
 from northfinder.estimation.quantiles import student_t
 from northfinder.report.chart_html import plot
 from northfinder.report.charts import Chart, Intervals, Item, Line, Mark
-from northfinder.report.content import with_interval
+from northfinder.report.content import direction_with_interval, with_interval
 from northfinder.report.document import table
 from northfinder.report.page import render
 from northfinder.text import printable
@@ -62,7 +64,7 @@ def _chart(
     items.append(Line(x=ends, y=np.full(2, np.nanmean(value)), role="model", label="mean"))
     return Chart(
         name=name, title=title, x_label="measurement", y_label="deg", items=tuple(items),
-        marks=_turn_ons(result), x_range=(0.5, len(value) + 0.5), numbered=True,
+        directions=name == "azimuth", marks=_turn_ons(result), x_range=(0.5, len(value) + 0.5), numbered=True,
         note="Every second turn-on is shaded." if result["n_turn_ons"] > 1 else "",
     )  # fmt: skip
 
@@ -84,7 +86,9 @@ def _parts(result: dict[str, Any]) -> list[str]:
 def _scatter_rows(result: dict[str, Any]) -> list[list[str]]:
     parts, azimuth = _parts(result), result["azimuth"]
     rows = [["n", *(str(azimuth[part]["n"]) for part in parts)]]
-    rows.append(["azimuth, deg", *(_pair(azimuth[part]["mean_deg"], azimuth[part]["sd_deg"]) for part in parts)])
+    means = (direction_text(azimuth[part]["mean_deg"], 3) for part in parts)
+    scattered = (_scattered(mean, azimuth[part]["sd_deg"]) for mean, part in zip(means, parts, strict=True))
+    rows.append(["azimuth, deg", *scattered])
     if result["true_latitude_deg"] is not None:
         levels = (azimuth[part]["sd_cos_latitude_deg"] for part in parts)
         rows.append(["sd · cos(latitude), deg", *(_number(level) for level in levels)])
@@ -103,7 +107,7 @@ def _judged_rows(result: dict[str, Any]) -> list[list[str]]:
             f"{name}, {_JUDGED[key]}",
             f"{each['rms']:.2f}",
             f"{each['low']:.2f} to {each['high']:.2f}",
-            f"{each['chi2']:.1f} of {each['dof']}",
+            f"{each['chi2']:.1f} with {each['dof']} degrees of freedom",
             f"{each['probability']:.2g}",
         ]
         for name, judged in result["consistency"].items()
@@ -111,19 +115,24 @@ def _judged_rows(result: dict[str, Any]) -> list[list[str]]:
     ]
 
 
-def _record_rows(result: dict[str, Any]) -> list[list[str]]:
-    rows = []
-    for number, row in enumerate(result["records"], start=1):
-        azimuth = " ± ".join(with_interval(row["azimuth_deg"], _HALF * row["azimuth_sd_deg"]))
-        latitude = row.get("latitude_stated_deg")
-        wide = row["latitude_sd_deg"]
-        shown = "" if latitude is None or not wide else " ± ".join(with_interval(latitude, _HALF * wide))
-        verdict = "trustworthy" if row["trustworthy"] else "not trustworthy"
-        name = printable(Path(row["record"]).name)
-        rows.append(
-            [str(number), row["started"][:16].replace("T", " "), str(row["turn_on"]), azimuth, shown, verdict, name]
-        )
-    return rows
+def _record_table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return head and rows of what each record states; no latitudes if none was measured."""
+    rows = [_record_row(number, row) for number, row in enumerate(result["records"], start=1)]
+    kept = [name for name in rows[0] if any(row[name] for row in rows)]
+    return kept, [[row[name] for name in kept] for row in rows]
+
+
+def _record_row(number: int, row: dict[str, Any]) -> dict[str, str]:
+    latitude, wide = row.get("latitude_stated_deg"), row["latitude_sd_deg"]
+    return {
+        "no.": str(number),
+        "started, UTC": row["started"][:16].replace("T", " "),
+        "turn-on": str(row["turn_on"]),
+        "azimuth": " ± ".join(direction_with_interval(row["azimuth_deg"], _HALF * row["azimuth_sd_deg"])),
+        "latitude": "" if latitude is None or not wide else " ± ".join(with_interval(latitude, _HALF * wide)),
+        "verdict": "trustworthy" if row["trustworthy"] else "not trustworthy",
+        "record": printable(Path(row["record"]).name),
+    }
 
 
 def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
@@ -135,6 +144,8 @@ def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
             f"{result['n_records']}, after {result['n_turn_ons']} turn-on{'s'[: result['n_turn_ons'] > 1]}",
         )
     ]
+    scatter = azimuth["all"]["sd_deg"]
+    rows += [] if scatter is None else [("sd of one measurement", f"{scatter:.3f}°")]
     rows += [] if within is None else [("sd within a turn-on", f"{within:.3f}°")]
     rows += [] if between is None else [("sd between turn-ons", f"{between:.3f}°")]
     rows += [] if result["pause_h"] is None else [("pause", f"{result['pause_h']:.3g} h")]
@@ -144,42 +155,73 @@ def _facts(result: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 _SCATTER_HEAD = "mean ± sd of one measurement"
-_JUDGED_HEAD = ["scatter over what was stated", "ratio", "95 % of honest ones", "chi square", "probability"]
-_RECORD_HEAD = ["", "started, UTC", "turn-on", "azimuth", "latitude", "", "record"]
+_JUDGED_HEAD = ["scatter", "ratio to what was stated", "honest: 95 % within", "chi square", "probability"]
+_PARTS = {"all": "all", "before": "before the pause", "after": "after the pause"}
+#: Turn-ons are taken to differ if chance alone would make them seem to less often than this.
+_UNLIKELY = 0.05
+
+
+def of_the_mean(result: dict[str, Any]) -> tuple[float, str]:
+    """Return half the 95 % interval of the mean azimuth, deg, and whose scatter it rests on, by Student's t.
+
+    Measurements after the same turn-on share what that turn-on brought: where turn-ons differ, they are what counts.
+    """
+    rows, centre = result["records"], result["azimuth"]["all"]["mean_deg"]
+    off = np.array([math.remainder(row["azimuth_deg"] - centre, 360.0) for row in rows])
+    probability = result["azimuth"]["between_turn_ons_probability"]
+    words = f"{len(rows)} measurements"
+    if probability is not None and probability < _UNLIKELY:
+        _, group, counts = np.unique([row["turn_on"] for row in rows], return_inverse=True, return_counts=True)
+        off = np.bincount(group, off) / counts
+        words = f"{len(off)} turn-ons, which differ"
+    return student_t(0.025, len(off) - 1) * float(np.std(off, ddof=1)) / math.sqrt(len(off)), words
 
 
 def campaign_page(result: dict[str, Any]) -> str:
     """Return the page of `campaign_report.campaign_json`."""
-    mean, sd = result["azimuth"]["all"]["mean_deg"], result["azimuth"]["all"]["sd_deg"] or 0.0
-    value, scatter = with_interval(mean, sd)
+    half, words = of_the_mean(result)
+    value, interval = direction_with_interval(result["azimuth"]["all"]["mean_deg"], half)
+    head, rows = _record_table(result)
     return render(
         "campaign.html",
         title=f"Campaign of {result['n_records']} measurements",
         value=value,
-        scatter=scatter,
+        interval=interval,
+        basis=words,
         facts=_facts(result),
         plots=[plot(chart) for chart in campaign_charts(result)],
-        scatter_head=[_SCATTER_HEAD, *_parts(result)],
+        scatter_head=_scatter_head(result),
         scatter_rows=_scatter_rows(result),
         judged_head=_JUDGED_HEAD,
         judged_rows=_judged_rows(result),
-        record_head=_RECORD_HEAD,
-        record_rows=_record_rows(result),
+        record_head=head,
+        record_rows=rows,
         version=version("northfinder"),
     )
 
 
 def campaign_markdown(result: dict[str, Any]) -> str:
     """Return the tables of `campaign_report.campaign_json` as Markdown."""
-    parts = [f"# Campaign of {result['n_records']} measurements", table(("", ""), _facts(result))]
-    parts += ["## Scatter", table([_SCATTER_HEAD, *_parts(result)], _scatter_rows(result))]
-    parts += [table(_JUDGED_HEAD, _judged_rows(result)), "## Records", table(_RECORD_HEAD, _record_rows(result))]
+    half, words = of_the_mean(result)
+    mean = " ± ".join(direction_with_interval(result["azimuth"]["all"]["mean_deg"], half))
+    parts = [f"# Campaign of {result['n_records']} measurements"]
+    parts += [f"Mean azimuth **{mean}**, 95 % interval by the scatter of {words}.", table(("", ""), _facts(result))]
+    parts += ["## Scatter", table(_scatter_head(result), _scatter_rows(result))]
+    parts += [table(_JUDGED_HEAD, _judged_rows(result)), "## Records", table(*_record_table(result))]
     return "\n\n".join(parts) + "\n"
 
 
+def _scatter_head(result: dict[str, Any]) -> list[str]:
+    return [_SCATTER_HEAD, *(_PARTS[part] for part in _parts(result))]
+
+
 def _pair(mean: float | None, sd: float | None) -> str:
-    return "" if mean is None else f"{mean:.3f} ± {_number(sd)}"
+    return "" if mean is None else _scattered(f"{mean:z.3f}", sd)
+
+
+def _scattered(mean: str, sd: float | None) -> str:
+    return mean if sd is None else f"{mean} ± {sd:.3f}"
 
 
 def _number(value: float | None) -> str:
-    return "?" if value is None else f"{value:.3f}"
+    return "" if value is None else f"{value:.3f}"

@@ -13,7 +13,7 @@ from northfinder.estimation import NoiseModel, RateMeans
 from northfinder.estimation.allan import averaging_factors, degrees_of_freedom, overlapping_allan_deviation
 from northfinder.estimation.quantiles import chi_square
 from northfinder.report.gather import Dwell, RecordReport
-from northfinder.report.series import thinned
+from northfinder.report.series import Series, thinned
 from northfinder.text import printable
 from northfinder.units import ARCSEC, DPH
 
@@ -23,8 +23,10 @@ Array = NDArray[np.float64]
 MAX_DWELLS = 48
 #: Longest moving average drawn over a dwell, s, as published (docs/method.md, section 2).
 AVERAGING_TIME = 60.0
-#: Steps are named in a chart of time if there are no more of them.
+#: Steps are named in a chart of time if there are no more of them, else numbered as far as they are drawn one by one.
 _MAX_NAMES = 12
+#: Part of a chart's width that a letter needs, on paper as well.
+_LETTER = 0.013
 _MINUTE = 60.0
 #: Means in a row that give an Allan deviation worth drawing.
 _SHORTEST_RUN = 6
@@ -97,6 +99,8 @@ class Chart:
     note: str = ""  #: what to see in it, in a sentence
     marks: tuple[Mark, ...] = ()
     logarithmic: bool = False  #: both axes
+    angles: bool = False  #: whether the vertical axis is of angles in deg, with ticks at parts of a circle
+    directions: bool = False  #: whether the vertical axis is of directions in deg, which end at 360
     numbered: bool = False  #: whether the horizontal axis counts something, in whole numbers
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
@@ -117,12 +121,15 @@ def charts(report: RecordReport) -> list[Chart]:
 
 
 def _marks(report: RecordReport) -> tuple[Mark, ...]:
-    """Return the dwells as marks, in minutes, named where there is room."""
+    """Return the dwells as marks, in minutes, named or numbered where there is room."""
+    total = max((dwell.stop for dwell in report.dwells), default=0.0)
     named = len(report.dwells) <= _MAX_NAMES
-    return tuple(
-        Mark(start=dwell.start / _MINUTE, stop=dwell.stop / _MINUTE, name=printable(dwell.span.name) if named else "")
-        for dwell in report.dwells
-    )
+    made = []
+    for number, dwell in enumerate(report.dwells, start=1):
+        name = printable(dwell.span.name) if named else str(number) if len(report.dwells) <= MAX_DWELLS else ""
+        fits = len(name) * _LETTER * total <= dwell.stop - dwell.start
+        made.append(Mark(start=dwell.start / _MINUTE, stop=dwell.stop / _MINUTE, name=name if fits else ""))
+    return tuple(made)
 
 
 def _time_range(report: RecordReport) -> tuple[float, float] | None:
@@ -157,7 +164,7 @@ def rate_chart(report: RecordReport) -> Chart | None:
         items=tuple(items),
         marks=_marks(report),
         x_range=_time_range(report),
-        note="Each step of the plan is shaded. What the dwells differ by is the earth's rotation about the input axis; "
+        note="Each dwell is shaded. What they differ by is the earth's rotation about the input axis; "
         "what they have in common is the bias.",
         height=1.15,
     )
@@ -283,7 +290,7 @@ def residual_charts(report: RecordReport) -> list[Chart | None]:
         items=tuple(items),
         marks=_marks(report),
         x_range=_time_range(report),
-        note=f"Of {fix.n_means} means.{left_out}{widened}",
+        note=f"What the model leaves of {fix.n_means:,} means.{left_out}{widened}",
         height=0.8,
     )
     return [over_time, allan_chart(used.with_rate(fix.residuals), report.noise)]
@@ -371,6 +378,7 @@ def stage_charts(report: RecordReport) -> list[Chart | None]:
             items=tuple(items),
             marks=_marks(report),
             x_range=_time_range(report),
+            angles=True,
             height=0.8,
         )
     ]
@@ -380,15 +388,25 @@ def environment_charts(report: RecordReport) -> list[Chart | None]:
     """Return tilt and temperature against time, where they were measured."""
     made: list[Chart | None] = []
     if report.tilt is not None:
-        items = [
-            Line(x=report.tilt.x / _MINUTE, y=report.tilt.mean[:, i] / ARCSEC, role=role, label=name)
-            for i, (name, role) in enumerate((("toward stage azimuth 0", "one"), ("toward stage azimuth 90", "two")))
-        ]
+        names = (("toward stage azimuth 0", "one"), ("toward stage azimuth 90", "two"))
+        tilt = Series(report.tilt.x, *(each / ARCSEC for each in (report.tilt.low, report.tilt.mean, report.tilt.high)))
+        items = [_slow_line(report, tilt, i, role, name) for i, (name, role) in enumerate(names)]
         made.append(_small("tilt", "Tilt", "arcsec", items, report))
     if report.temperature is not None:
-        line = Line(x=report.temperature.x / _MINUTE, y=report.temperature.mean[:, 0], role="one")
-        made.append(_small("temperature", "Temperature", "°C", [line], report))
+        made.append(
+            _small("temperature", "Temperature", "°C", [_slow_line(report, report.temperature, 0, "one")], report)
+        )
     return made
+
+
+def _slow_line(report: RecordReport, series: Series, column: int, role: str, label: str = "") -> Line:
+    """Return a line that is broken between dwells, where nothing was measured."""
+    dwells = report.dwells[:MAX_DWELLS]
+    group = np.searchsorted([dwell.start for dwell in dwells], series.x) - 1
+    # What was put together from the end of a dwell and the begin of the next stands between them, and is not drawn.
+    inside = series.x <= np.array([*(dwell.stop for dwell in dwells[:-1]), math.inf])[group]
+    x, y = broken(series.x[inside] / _MINUTE, series.mean[inside, column], group[inside])
+    return Line(x=x, y=y, role=role, label=label)
 
 
 def _small(name: str, title: str, unit: str, items: Sequence[Item], report: RecordReport) -> Chart:

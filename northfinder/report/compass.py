@@ -58,7 +58,7 @@ def _graduation() -> str:
 
 
 def _outside(angle_deg: float, role: str) -> str:
-    """Return a small mark outside of the ring."""
+    """Return a small mark outside of the ring; by its role it is filled or not, so that no colour is needed."""
     return (
         f'<path class="north {role}" d="M{_point(angle_deg, 152.0)}L{_point(angle_deg - 2.2, 163.0)}'
         f'L{_point(angle_deg + 2.2, 163.0)}Z"/>'
@@ -88,7 +88,7 @@ def strip(azimuth_deg: float, half_deg: float, *, truth_deg: float | None) -> Ma
     A truth that lies further off is drawn at the end.
     """
     reach = max(_STRIP_REACH * half_deg, 1e-6)
-    axis = Axis(azimuth_deg - reach, azimuth_deg + reach)
+    axis = Axis(azimuth_deg - reach, azimuth_deg + reach, directions=True)
     low, high = (_along(axis, azimuth_deg + k * half_deg) for k in (-1.0, 1.0))
     parts = [
         f'<path class="coarse" d="M{_STRIP_MARGIN:g} 26H{_STRIP_WIDTH - _STRIP_MARGIN:g}"/>',
@@ -97,8 +97,7 @@ def strip(azimuth_deg: float, half_deg: float, *, truth_deg: float | None) -> Ma
     ]
     for value, text in _few(axis.ticks()):
         x = _along(axis, value)
-        shown = text if 0.0 <= value < 360.0 else f"{value % 360.0:.{len(text.partition('.')[2])}f}"
-        parts.append(f'<path class="fine" d="M{x:.1f} 26v5"/><text class="degree" x="{x:.1f}" y="43">{shown}°</text>')
+        parts.append(f'<path class="fine" d="M{x:.1f} 26v5"/><text class="degree" x="{x:.1f}" y="43">{text}°</text>')
     if truth_deg is not None:
         off = math.remainder(truth_deg - azimuth_deg, 360.0)
         x = _along(axis, azimuth_deg + max(-reach, min(reach, off)))

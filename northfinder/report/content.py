@@ -10,10 +10,16 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from northfinder.angles import decimals_for, direction_text
+from northfinder.estimation.quantiles import student_t
 from northfinder.report.gather import RecordReport
 from northfinder.text import printable
 
 _NOTHING = 1e-9  # deg
+#: Least part of the uncertainty that is told in figures, deg.
+_LEAST_SHARE = 1e-4
+#: Half of a 95 % interval in standard deviations that are known.
+_HALF = student_t(0.025, math.inf)
 #: A name or note longer than this is cut.
 _MAX_TEXT = 500
 
@@ -57,12 +63,27 @@ def with_interval(value_deg: float, half_deg: float) -> tuple[str, str]:
     >>> with_interval(32.96839, 0.20742)
     ('32.97°', '0.21°')
     """
-    decimals = 3 if half_deg <= 0.0 else min(6, max(0, 1 - math.floor(math.log10(half_deg))))
-    return _signed(value_deg, decimals), f"{half_deg:.{decimals}f}°"
+    decimals = decimals_for(half_deg)
+    return signed(value_deg, decimals), f"{half_deg:.{decimals}f}°"
 
 
-def _signed(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}°".replace("-", "−")
+def direction_with_interval(angle_deg: float, half_deg: float) -> tuple[str, str]:
+    """Return the same of a direction, which ends below 360 deg.
+
+    >>> direction_with_interval(359.999, 0.20742)
+    ('0.00°', '0.21°')
+    """
+    decimals = decimals_for(half_deg)
+    return f"{direction_text(angle_deg, decimals)}°", f"{half_deg:.{decimals}f}°"
+
+
+def signed(value: float, decimals: int) -> str:
+    """Return an angle in deg as text.
+
+    >>> signed(-64.944, 2), signed(-0.0001, 2)
+    ('−64.94°', '0.00°')
+    """
+    return f"{value:z.{decimals}f}°".replace("-", "−")
 
 
 def azimuth_figure(report: RecordReport) -> Figure | None:
@@ -71,14 +92,10 @@ def azimuth_figure(report: RecordReport) -> Figure | None:
     if report.fix is None:
         return None
     half = report.interval * result["azimuth_sd_deg"]
-    value, interval = with_interval(result["azimuth_deg"], half)
-    ends = (_signed((result["azimuth_deg"] + k * half) % 360.0, _decimals(interval)) for k in (-1.0, 1.0))
-    detail = f"true azimuth of the input axis at stage azimuth zero; 95 % interval {' to '.join(ends)}"
-    return Figure(name="Azimuth", value=value, interval=interval, detail=detail, role="accent")
-
-
-def _decimals(text: str) -> int:
-    return len(text.rstrip("°").partition(".")[2])
+    value, interval = direction_with_interval(result["azimuth_deg"], half)
+    ends = (direction_with_interval(result["azimuth_deg"] + k * half, half)[0] for k in (-1.0, 1.0))
+    detail = f"95 % interval {' to '.join(ends)}; of the input axis at stage azimuth zero, clockwise from true north"
+    return Figure(name="True azimuth", value=value, interval=interval, detail=detail, role="accent")
 
 
 def other_figures(report: RecordReport) -> list[Figure]:
@@ -92,7 +109,7 @@ def _latitude(report: RecordReport) -> Figure:
     if latitude is None:
         return Figure(name="Latitude", value="", detail=f"not measured: {result['latitude_reason']}")
     if not sd:
-        return Figure(name="Latitude", value=_signed(latitude, 3), detail="as given")
+        return Figure(name="Latitude", value=signed(latitude, 3), detail="as given")
     value, interval = with_interval(latitude, report.interval * sd)
     return Figure(name="Latitude", value=value, interval=interval, detail=_latitude_source(report))
 
@@ -104,16 +121,16 @@ def _latitude_source(report: RecordReport) -> str:
 
 def _bearings(report: RecordReport) -> list[Figure]:
     if "position" not in report.result:
-        detail = "with a position: --position LAT,LON"
+        detail = "no position given (--position LAT,LON)"
         return [Figure(name=name, value="", detail=detail) for name in ("Grid azimuth", "Magnetic bearing")]
     grid, magnetic = report.result["grid"], report.result["magnetic"]
     figures = [_missing("Grid azimuth", grid), _missing("Magnetic bearing", magnetic)]
     if "azimuth_deg" in grid:
-        value, interval = with_interval(grid["azimuth_deg"], report.interval * grid["azimuth_sd_deg"])
-        detail = f"{printable(grid['name'])}, EPSG:{grid['epsg']}; convergence {_signed(grid['convergence_deg'], 4)}"
+        value, interval = direction_with_interval(grid["azimuth_deg"], report.interval * grid["azimuth_sd_deg"])
+        detail = f"{printable(grid['name'])}, EPSG:{grid['epsg']}; convergence {signed(grid['convergence_deg'], 4)}"
         figures[0] = Figure(name="Grid azimuth", value=value, interval=interval, detail=detail, role="two")
     if "bearing_deg" in magnetic:
-        value, interval = with_interval(magnetic["bearing_deg"], report.interval * magnetic["bearing_sd_deg"])
+        value, interval = direction_with_interval(magnetic["bearing_deg"], report.interval * magnetic["bearing_sd_deg"])
         declination, wide = with_interval(magnetic["declination_deg"], report.interval * magnetic["declination_sd_deg"])
         detail = (
             f"declination {declination} ± {wide} on {magnetic['date']} by {printable(magnetic['model'])}, "
@@ -156,11 +173,11 @@ def verdicts(report: RecordReport) -> list[Verdict]:
     return sorted(made, key=lambda each: each.passed)
 
 
-def budget_lines(report: RecordReport) -> tuple[list[BudgetLine], str]:
-    """Return what the uncertainty is made of, the largest first, and what is taken as exact."""
+def budget_lines(report: RecordReport) -> tuple[list[BudgetLine], list[str]]:
+    """Return what the uncertainty is made of, the largest first, and in sentences what adds nothing to it."""
     lines = report.result.get("budget", [])
-    felt = [line for line in lines if line["sd"]]
-    widest = max((max(line["azimuth_deg"], line["latitude_deg"]) for line in felt), default=0.0) or 1.0
+    largest = {line["quantity"]: max(line["azimuth_deg"], line["latitude_deg"]) for line in lines}
+    widest = max(largest.values(), default=0.0)
     made = [
         BudgetLine(
             quantity=line["quantity"],
@@ -170,13 +187,19 @@ def budget_lines(report: RecordReport) -> tuple[list[BudgetLine], str]:
             latitude=_share(line["latitude_deg"]),
             latitude_width=100.0 * line["latitude_deg"] / widest,
         )
-        for line in felt
+        for line in lines
+        if largest[line["quantity"]] > _NOTHING
     ]
-    return made, ", ".join(line["quantity"] for line in lines if not line["sd"])
+    idle = [line["quantity"] for line in lines if line["sd"] and largest[line["quantity"]] <= _NOTHING]
+    exact = [line["quantity"] for line in lines if not line["sd"]]
+    told = (("Without effect on this measurement", idle), ("Taken as exact", exact))
+    return made, [f"{what}: {', '.join(names)}." for what, names in told if names]
 
 
 def _share(angle_deg: float) -> str:
-    return f"{angle_deg:.4f}°" if angle_deg > _NOTHING else "none"
+    if angle_deg <= _NOTHING:
+        return "none"
+    return f"{angle_deg:.4f}°" if angle_deg >= _LEAST_SHARE else f"< {_LEAST_SHARE:.4f}°"
 
 
 def identity_rows(report: RecordReport) -> list[tuple[str, str]]:
@@ -223,9 +246,9 @@ def summary_rows(report: RecordReport) -> list[tuple[str, str]]:
         often = "once" if report.n_streams == 2 else f"{report.n_streams - 1} times"
         rows.append(("resumed", f"{often}, after an interruption"))
     n_samples = sum(dwell.n_samples for dwell in report.dwells)
-    lost = f", {report.n_missing} missing" if report.n_missing else ", none missing"
-    unfit = f", {report.n_unfit} declared unfit by the gyro" if report.n_unfit else ""
-    rows.append(("samples in dwells", f"{n_samples}{lost}{unfit}"))
+    lost = f", {report.n_missing:,} missing" if report.n_missing else ", none missing"
+    unfit = f", {report.n_unfit:,} declared unfit by the gyro" if report.n_unfit else ""
+    rows.append(("samples in dwells", f"{n_samples:,}{lost}{unfit}"))
     return [(name, printable(value)) for name, value in rows]
 
 
@@ -239,10 +262,10 @@ def method_rows(report: RecordReport) -> list[tuple[str, str]]:
         rows.append(("noise model", f"profile {assumptions.profile.name}: {_noise_text(report)}"))
     if fix.normalised_residual is not None:
         rows.append(("residuals", f"{math.sqrt(fix.normalised_residual):.3f} of what the noise model predicts"))
-    rows.append(("widened", f"{fix.rescaled_by:.2f} times" if fix.rescaled_by > 1.0 else "no"))
-    rows.append(("95 % interval", f"± {report.interval:.3f} standard deviations"))
+    widened = f"all widened {fix.rescaled_by:.2f} times, by the residuals" if fix.rescaled_by > 1.0 else "not widened"
+    rows.append(("95 % intervals", f"± {report.interval:.3f} standard deviations, {widened}"))
     bias = result["bias_dph"]
-    shown = ", ".join(f"{each:.3f}" for each in (bias if isinstance(bias, list) else [bias]))
+    shown = ", ".join(f"{each:z.3f}" for each in (bias if isinstance(bias, list) else [bias]))
     rows.append(("bias", f"{shown} deg/h".replace("-", "−")))
     if result["scale_factor"] is not None:
         rows.append(
@@ -282,8 +305,16 @@ def _noise_text(report: RecordReport) -> str:
 
 
 def _closed_form_text(table: dict[str, Any]) -> str:
-    text = f"azimuth {table['azimuth_deg']:.3f}° by (2)"
-    return text if table["latitude_deg"] is None else f"{text}, latitude {table['latitude_deg']:.3f}° by (3)"
+    """Return what formulas (2) and (3) give, which know nothing of noise, nor of drift rates that gravity brings."""
+    text = f"azimuth {direction_text(table['azimuth_deg'], 3)}°{_plus_minus(table['azimuth_sd_deg'])} by (2)"
+    if table["latitude_deg"] is None:
+        return text
+    latitude = f"latitude {signed(table['latitude_deg'], 3)}{_plus_minus(table['latitude_sd_deg'])} by (3)"
+    return f"{text}, {latitude}, nothing corrected; for comparison only"
+
+
+def _plus_minus(sd_deg: float | None) -> str:
+    return "" if sd_deg is None else f" ± {_HALF * sd_deg:.3f}°"
 
 
 def event_rows(report: RecordReport) -> tuple[list[tuple[str, str, str]], int]:

@@ -86,12 +86,12 @@ def record_markdown(report: RecordReport) -> str:
         parts.append(table(("", "± is the 95 % interval", ""), rows))
     checks = [(each.verdict, each.sentence) for each in verdicts(report)]
     parts += ["## Checks", table(("", ""), checks)] if checks else []
-    lines, exact = budget_lines(report)
+    lines, idle = budget_lines(report)
     if lines:
         shares = [(line.quantity, line.size, line.azimuth, line.latitude) for line in lines]
         head = ("standard uncertainty", "", "in azimuth", "in latitude")
         parts += ["## What the uncertainty is made of", table(head, shares)]
-        parts += [f"Taken as exact: {escaped(exact)}."] if exact else []
+        parts += [escaped(" ".join(idle))]
     parts += ["## Measurement", table(("", ""), summary_rows(report)), _dwell_table(report)]
     parts += ["## How it was computed", table(("", ""), method_rows(report))] if method_rows(report) else []
     parts += ["## Instrument and software", table(("", ""), identity_rows(report))]
@@ -118,7 +118,8 @@ def _dwell_table(report: RecordReport) -> str:
     for number, dwell in enumerate(report.dwells, start=1):
         span = dwell.span
         angles = (f"{math.degrees(angle):.4f}" for angle in (span.measured_azimuth, span.measured_elevation))
-        mean, sd = (", ".join(f"{each / DPH:.4g}" for each in values) for values in (dwell.mean, dwell.raw_sd))
+        mean = ", ".join(f"{each / DPH:z.3f}" for each in dwell.mean)
+        sd = ", ".join(f"{each / DPH:.3g}" for each in dwell.raw_sd)
         seconds = f"{(span.stop_index - span.first_index) / span.sample_rate:.1f}"
         rows.append((str(number), printable(span.name), *angles, seconds, mean, sd))
     return table(head, rows) if rows else ""

@@ -151,7 +151,9 @@ def _require_possible(record: Record, span: DwellSpan) -> None:
 
 def _estimate(record: Record, reduction: Reduction, place: Place | None) -> dict[str, Any]:
     """Return the fields that follow from the fix, as far as there is one."""
-    about = {"record": str(record.path)} | completeness(record)
+    plan = record.meta("plan")
+    name = plan.get("name") if isinstance(plan, dict) else None
+    about = {"plan": name, "record": str(record.path)} | completeness(record)
     assumptions, means = None, None
     found: dict[str, Any] = {"fix": None, "used": None, "noise": None, "interval": math.nan, "failure": ""}
     try:

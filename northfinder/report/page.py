@@ -36,7 +36,7 @@ def record_page(report: RecordReport) -> str:
     """Return the page of one record."""
     pairs = dwell_pairs(report)
     good, words = standing(report)
-    budget, exact = budget_lines(report)
+    budget, idle = budget_lines(report)
     events, n_more_events = event_rows(report)
     began = "" if report.started is None else f", {moment(report.started)[:16]} UTC"
     return render(
@@ -49,10 +49,10 @@ def record_page(report: RecordReport) -> str:
         others=other_figures(report),
         rose=_rose(report),
         strip=_strip(report),
-        truth=report.truth is not None,
+        truth="" if report.truth is None else f"{report.truth[0]:g}°",
         verdicts=verdicts(report),
         budget=budget,
-        exact=exact,
+        idle=idle,
         has_latitude=any(line.latitude_width for line in budget),
         summary=summary_rows(report),
         plots=_named(report),
@@ -117,9 +117,9 @@ def _dwell(pair: DwellPair) -> dict[str, Any]:
     azimuth, elevation = math.degrees(span.measured_azimuth), math.degrees(span.measured_elevation)
     return {
         "title": f"{pair.number} {printable(span.name, max_length=20)}",
-        "mean": _joined(pair.mean, "+.3f"),
+        "mean": _joined(pair.mean, "z.3f"),
         "sd": _joined(pair.dwell.raw_sd / DPH, ".3g"),
-        "position": f"{azimuth:.2f}°, {elevation:.2f}°, {span.dwell:.0f} s".replace("-", "−"),
+        "position": f"at {azimuth:z.1f}°, {elevation:z.1f}°, {span.dwell:.0f} s".replace("-", "−"),
         "raw": plot(pair.raw),
         "averaged": plot(pair.averaged),
     }
