@@ -39,7 +39,7 @@ from northfinder.measurement import Measurement, measure
 from northfinder.record.schema import INSERT, NAMES, sealed
 from northfinder.report.axes import Axis
 from northfinder.report.campaign import of_the_mean
-from northfinder.report.charts import Line, Mark, broken, charts, dwell_pairs, pooled_allan
+from northfinder.report.charts import Line, Mark, broken, charts, dwell_pairs, moving_average, pooled_allan
 from northfinder.report.compass import rose
 from northfinder.report.content import azimuth_figure, budget_lines, method_rows, other_figures, standing
 from northfinder.report.document import record_json, record_markdown
@@ -255,6 +255,14 @@ def test_dwells_are_shown_as_measured(report: RecordReport) -> None:
     assert raw is not None
     assert averaged is not None
     assert raw[1] > 100.0 * averaged[1]
+
+
+@pytest.mark.parametrize("window", [1.0, 4.0, 5.0, 60.0])
+def test_a_moving_average_stands_in_the_middle_of_what_it_averages(window: float) -> None:
+    """A ramp stays where it is, whether an even or an odd number of values is averaged."""
+    x, y = moving_average(np.arange(60.0) + 0.5, 3.0 * (np.arange(60.0) + 0.5), window)
+    assert len(x) == 60 - round(window) + 1
+    assert y == pytest.approx(3.0 * x)
 
 
 def test_the_stage_is_drawn_in_the_time_of_the_samples(report: RecordReport) -> None:

@@ -245,8 +245,8 @@ def _dwell_pair(number: int, dwell: Dwell, means: RateMeans) -> DwellPair:
         seconds = means.middle - dwell.start
         off = (means.rate[:, axis] - mean[axis]) / DPH
         averaged.append(Line(x=seconds, y=off, role="faint", label="" if axis else "means of 1 s"))
-        smooth = _moving_average(off, window)
-        averaged.append(Line(x=seconds, y=smooth, role=role, label="moving average"))
+        middle, smooth = moving_average(seconds, off, window)
+        averaged.append(Line(x=middle, y=smooth, role=role, label="moving average"))
     length = (span.stop_index - first) / span.sample_rate
     title = f"{number} {span.name}"
     return DwellPair(
@@ -261,14 +261,17 @@ def _dwell_pair(number: int, dwell: Dwell, means: RateMeans) -> DwellPair:
     )
 
 
-def _moving_average(values: Array, window: float) -> Array:
-    """Return the mean over `window` s of means of 1 s about each of them, nan where it would reach beyond an end."""
+def moving_average(x: Array, y: Array, window: float) -> tuple[Array, Array]:
+    """Return the means of places and values over as many values as `window` says, none that reach beyond an end.
+
+    >>> moving_average(np.arange(4.0), np.arange(4.0), 2.0)[0].tolist()
+    [0.5, 1.5, 2.5]
+    """
     n = max(1, round(window))
-    smooth = np.full(len(values), math.nan)
-    if len(values) >= n:
-        inside = np.convolve(values, np.full(n, 1.0 / n), mode="valid")
-        smooth[(n - 1) // 2 : (n - 1) // 2 + len(inside)] = inside
-    return smooth
+    if len(y) < n:
+        return np.zeros(0), np.zeros(0)
+    x, y = (np.convolve(each, np.full(n, 1.0 / n), mode="valid") for each in (x, y))
+    return x, y
 
 
 def residual_charts(report: RecordReport) -> list[Chart | None]:
