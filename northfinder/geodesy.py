@@ -20,6 +20,8 @@ from northfinder.text import printable
 _UTM_SOUTH, _UTM_NORTH = -80.0, 84.0
 #: Heights in m for which the magnetic model is made.
 _HEIGHTS = (-1_000.0, 850_000.0)
+#: By so many deg, about 1 km, a latitude given as exact may differ from that of the position: either may be rounded.
+_ROUNDED = 0.01
 #: Below so many nT of horizontal intensity compasses, and the model's declination with them, are unreliable.
 _BLACKOUT = 2000.0
 _POSITION_FORM = "LAT,LON[,HEIGHT] in deg and m, such as 50.429,30.523,170"
@@ -250,23 +252,24 @@ def _magnetic_json(place: Place, result: Mapping[str, Any], date: dt.date) -> di
 def position_check(position: Position, result: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return whether the latitude of a result agrees with the position's, None if the result has none.
 
-    It is not decisive: the fix does not rest on the position.
+    It is not decisive: the fix does not rest on the position. A latitude that was given exactly may be rounded.
     """
     if result["latitude_deg"] is None:
         return None
     difference = math.radians(result["latitude_deg"]) - position.latitude
     sd = math.radians(result["latitude_sd_deg"])
     check: Check = agreement("latitude", difference, sd, "rad", math.inf)
-    passed = check.passed or abs(difference) < 1e-9  # given both times, and the same
-    figures = f"it differs by {math.degrees(difference):.3g} deg, limit {math.degrees(check.limit):.2g} deg"
+    limit = math.degrees(check.limit) if sd else _ROUNDED
+    passed = abs(math.degrees(difference)) <= limit
     measured = "measured" if sd else "given"
+    figures = f"it differs by {math.degrees(difference):.3g} deg, limit {limit:.2g} deg"
     return {
         "name": "position",
         "passed": passed,
         "decisive": False,
         "value": math.degrees(difference),
         "sd": math.degrees(sd),
-        "limit": math.degrees(check.limit),
+        "limit": limit,
         "unit": "deg",
         "sentence": f"the {measured} latitude {'agrees' if passed else 'does not agree'} with the position: {figures}",
     }

@@ -177,6 +177,15 @@ def test_the_position_checks_the_measured_latitude(latitude: float, passed: bool
     assert ("does not agree" in checks[1]["sentence"]) is not passed
 
 
+@pytest.mark.parametrize(("latitude", "passed"), [(50.0, True), (50.0009, True), (49.98, False), (-50.0, False)])
+def test_a_latitude_that_was_given_may_be_rounded(latitude: float, passed: bool) -> None:  # noqa: FBT001  # a case
+    """A thousandth of a degree is no slip, and no reason for a warning; the wrong hemisphere is."""
+    (_, check) = bearings_json(Place(at(50.0, 30.5)), result(latitude, 0.0), dt.date(2026, 11, 22))["checks"]
+    assert check["passed"] is passed
+    assert check["limit"] > 0.0
+    assert check["sentence"].startswith("the given latitude " + ("agrees" if passed else "does not agree"))
+
+
 def test_a_latitude_that_was_not_measured_is_not_checked() -> None:
     """There is nothing to compare."""
     said = bearings_json(Place(at(50.0, 30.5)), result(None, None), dt.date(2026, 11, 22))

@@ -288,6 +288,8 @@ def test_what_adds_nothing_to_the_uncertainty_has_no_bar(report: RecordReport) -
     assert [line.quantity for line in others] == [line.quantity for line in lines[1:]]
     assert others[0].azimuth == "< 0.0001°"
     assert more == [f"Without effect on this measurement: {lines[0].quantity}.", *idle]
+    widened = budget_lines(replace(report, result=report.result | {"rescaled_by": 1.694}))[1]
+    assert widened == ["The noise is 1.69 times the profile's, as the residuals ask.", *idle]
 
 
 def test_published_formulas_stand_with_their_intervals(report: RecordReport) -> None:
@@ -303,9 +305,12 @@ def test_dwells_are_named_where_there_is_room(report: RecordReport) -> None:
     assert [mark.name for mark in _rate_marks(report)] == ["U1", "U2", "U3", "U4", "U1", "U5", "U6", "U1"]
     many = replace(report, dwells=report.dwells * 2)
     assert [mark.name for mark in _rate_marks(many)] == [str(number) for number in range(1, 17)]
-    first = report.dwells[0]
-    renamed = replace(first, span=replace(first.span, name="a name of forty letters, more or less so"))
-    assert _rate_marks(replace(report, dwells=(renamed, *report.dwells[1:])))[0].name == ""
+    long = [
+        replace(each, span=replace(each.span, name="a name of forty letters, more or less so"))
+        for each in report.dwells
+    ]
+    assert [mark.name for mark in _rate_marks(replace(report, dwells=(long[0], *report.dwells[1:])))][:2] == ["", "U2"]
+    assert [mark.name for mark in _rate_marks(replace(report, dwells=tuple(long)))] == [str(n) for n in range(1, 9)]
 
 
 def _rate_marks(report: RecordReport) -> tuple[Mark, ...]:
@@ -559,6 +564,10 @@ def test_a_picture_of_one_part(emulated: Path, early: Path, tmp_path: Path) -> N
     for file in files:
         assert invoke("report", emulated, "--part", "rate", "-o", file).exit_code == 0
     assert files[0].read_bytes() == files[1].read_bytes()
+    none = tmp_path / "none.svg"
+    assert invoke("report", early, "-o", none).exit_code == 0
+    said = " ".join(re.findall(r"<!-- (.*?) -->", none.read_text(encoding="utf-8")))
+    assert "No azimuth these positions do not determine" in said
     done = invoke("report", early, "--part", "allan", "-o", tmp_path / "a.svg")
     assert "nothing to draw as --part allan" in str(done.exception)
 

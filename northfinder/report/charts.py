@@ -26,7 +26,7 @@ AVERAGING_TIME = 60.0
 #: Steps are named in a chart of time if there are no more of them, else numbered as far as they are drawn one by one.
 _MAX_NAMES = 12
 #: Part of a chart's width that a letter needs, on paper as well.
-_LETTER = 0.013
+_LETTER = 0.0105
 _MINUTE = 60.0
 #: Means in a row that give an Allan deviation worth drawing.
 _SHORTEST_RUN = 6
@@ -121,15 +121,23 @@ def charts(report: RecordReport) -> list[Chart]:
 
 
 def _marks(report: RecordReport) -> tuple[Mark, ...]:
-    """Return the dwells as marks, in minutes, named or numbered where there is room."""
+    """Return the dwells as marks, in minutes, named where there is room; numbered where few names find room."""
     total = max((dwell.stop for dwell in report.dwells), default=0.0)
-    named = len(report.dwells) <= _MAX_NAMES
-    made = []
-    for number, dwell in enumerate(report.dwells, start=1):
-        name = printable(dwell.span.name) if named else str(number) if len(report.dwells) <= MAX_DWELLS else ""
-        fits = len(name) * _LETTER * total <= dwell.stop - dwell.start
-        made.append(Mark(start=dwell.start / _MINUTE, stop=dwell.stop / _MINUTE, name=name if fits else ""))
-    return tuple(made)
+    names = [printable(dwell.span.name) for dwell in report.dwells]
+    numbers = [str(number) for number in range(1, len(names) + 1)]
+    named, numbered = (_fitting(each, report.dwells, total) for each in (names, numbers))
+    few = 2 * sum(map(bool, named)) < len(named) or len(named) > _MAX_NAMES
+    shown = named if not few else numbered if len(named) <= MAX_DWELLS else [""] * len(named)
+    return tuple(
+        Mark(start=dwell.start / _MINUTE, stop=dwell.stop / _MINUTE, name=name)
+        for dwell, name in zip(report.dwells, shown, strict=True)
+    )
+
+
+def _fitting(names: Sequence[str], dwells: Sequence[Dwell], total: float) -> list[str]:
+    """Return the names, empty where a dwell is too short for its name in a chart of `total` s."""
+    room = [(dwell.stop - dwell.start) / (_LETTER * total) for dwell in dwells]
+    return [name if len(name) <= letters else "" for name, letters in zip(names, room, strict=True)]
 
 
 def _time_range(report: RecordReport) -> tuple[float, float] | None:

@@ -174,7 +174,7 @@ def verdicts(report: RecordReport) -> list[Verdict]:
 
 
 def budget_lines(report: RecordReport) -> tuple[list[BudgetLine], list[str]]:
-    """Return what the uncertainty is made of, the largest first, and in sentences what adds nothing to it."""
+    """Return what the uncertainty is made of, the largest first, and in sentences what must be known of it."""
     lines = report.result.get("budget", [])
     largest = {line["quantity"]: max(line["azimuth_deg"], line["latitude_deg"]) for line in lines}
     widest = max(largest.values(), default=0.0)
@@ -193,7 +193,10 @@ def budget_lines(report: RecordReport) -> tuple[list[BudgetLine], list[str]]:
     idle = [line["quantity"] for line in lines if line["sd"] and largest[line["quantity"]] <= _NOTHING]
     exact = [line["quantity"] for line in lines if not line["sd"]]
     told = (("Without effect on this measurement", idle), ("Taken as exact", exact))
-    return made, [f"{what}: {', '.join(names)}." for what, names in told if names]
+    said = [f"{what}: {', '.join(names)}." for what, names in told if names]
+    if made and report.noise is not None and report.result["rescaled_by"] > 1.0:
+        said.insert(0, f"The noise is {report.result['rescaled_by']:.2f} times the profile's, as the residuals ask.")
+    return made, said
 
 
 def _share(angle_deg: float) -> str:

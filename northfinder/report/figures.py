@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from northfinder.report.content import (
     standing,
 )
 from northfinder.report.gather import RecordReport
+from northfinder.text import printable
 
 COLOURS = {
     "one": "#1e5ba6", "two": "#96590a", "three": "#2a7348", "accent": "#b0341f", "faint": "#74808c",
@@ -122,7 +124,9 @@ def overview(report: RecordReport) -> Figure:
         draw(figure.add_axes((0.06, 0.13, 0.56, 0.74)), every["rate"])
     answer = azimuth_figure(report)
     if answer is None:
-        figure.text(0.99, 0.95, standing(report)[1], ha="right")
+        figure.text(0.82, 0.6, standing(report)[1], ha="center", fontsize=17, weight="bold")
+        reason = "\n".join(textwrap.wrap(printable(report.failure, max_length=300), 42))
+        figure.text(0.82, 0.56, reason, ha="center", va="top", fontsize=8.5, color=MUTED)
         return figure
     draw_rose(cast("PolarAxes", figure.add_axes((0.71, 0.25, 0.22, 0.5), projection="polar")), report)
     figure.text(0.82, 0.94, f"{answer.value} ± {answer.interval}", ha="center", va="center", fontsize=17, weight="bold")
