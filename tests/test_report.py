@@ -494,6 +494,9 @@ def test_three_axes_and_many_dwells(axes: Path) -> None:
     check_self_contained(page)
     assert "axis 3" in page.text
     assert "The 12 later dwells are not drawn" in page.text
+    loud = replace(report, dwells=tuple(replace(each, raw_sd=100.0 * each.raw_sd) for each in report.dwells))
+    for text in (record_page(loud), record_markdown(loud)):
+        assert not re.search(r"\de\+\d", text)  # no power of ten among figures for people
     assert report.n_missing == 0
 
 

@@ -86,6 +86,15 @@ def signed(value: float, decimals: int) -> str:
     return f"{value:z.{decimals}f}°".replace("-", "−")
 
 
+def three_digits(value: float) -> str:
+    """Return a size to three digits, one of thousands in full.
+
+    >>> three_digits(0.017654), three_digits(253.8), three_digits(2134.6)
+    ('0.0177', '254', '2,135')
+    """
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:,.0f}"  # never with a power of ten
+
+
 def azimuth_figure(report: RecordReport) -> Figure | None:
     """Return the azimuth, None without a fix."""
     result = report.result

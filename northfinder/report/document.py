@@ -20,6 +20,7 @@ from northfinder.report.content import (
     other_figures,
     standing,
     summary_rows,
+    three_digits,
     verdicts,
 )
 from northfinder.report.gather import Dwell, RecordReport
@@ -119,7 +120,7 @@ def _dwell_table(report: RecordReport) -> str:
         span = dwell.span
         angles = (f"{math.degrees(angle):.4f}" for angle in (span.measured_azimuth, span.measured_elevation))
         mean = ", ".join(f"{each / DPH:z.3f}" for each in dwell.mean)
-        sd = ", ".join(f"{each / DPH:.3g}" for each in dwell.raw_sd)
+        sd = ", ".join(map(three_digits, dwell.raw_sd / DPH))
         seconds = f"{(span.stop_index - span.first_index) / span.sample_rate:.1f}"
         rows.append((str(number), printable(span.name), *angles, seconds, mean, sd))
     return table(head, rows) if rows else ""

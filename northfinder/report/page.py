@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -25,6 +23,7 @@ from northfinder.report.content import (
     other_figures,
     standing,
     summary_rows,
+    three_digits,
     verdicts,
 )
 from northfinder.report.gather import RecordReport
@@ -109,7 +108,7 @@ def _named(report: RecordReport) -> dict[str, Plot | None]:
 
 
 def _limit(y_range: tuple[float, float] | None) -> str:
-    return "" if y_range is None else f"{y_range[1]:.2g}" if y_range[1] < 100 else f"{y_range[1]:.0f}"
+    return "" if y_range is None else f"{y_range[1]:.2g}" if y_range[1] < 100 else f"{y_range[1]:,.0f}"
 
 
 def _dwell(pair: DwellPair) -> dict[str, Any]:
@@ -117,13 +116,9 @@ def _dwell(pair: DwellPair) -> dict[str, Any]:
     azimuth, elevation = math.degrees(span.measured_azimuth), math.degrees(span.measured_elevation)
     return {
         "title": f"{pair.number} {printable(span.name, max_length=20)}",
-        "mean": _joined(pair.mean, "z.3f"),
-        "sd": _joined(pair.dwell.raw_sd / DPH, ".3g"),
+        "mean": ", ".join(f"{each:z.3f}" for each in pair.mean).replace("-", "−"),
+        "sd": ", ".join(map(three_digits, pair.dwell.raw_sd / DPH)),
         "position": f"at {azimuth:z.1f}°, {elevation:z.1f}°, {span.dwell:.0f} s".replace("-", "−"),
         "raw": plot(pair.raw),
         "averaged": plot(pair.averaged),
     }
-
-
-def _joined(values: Sequence[float] | np.ndarray[tuple[Any, ...], np.dtype[np.float64]], form: str) -> str:
-    return ", ".join(f"{value:{form}}" for value in values).replace("-", "−")
