@@ -8,6 +8,7 @@ instrument waits for the gyro.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntFlag
 from typing import Protocol
@@ -17,6 +18,10 @@ from numpy.typing import NDArray
 
 #: Rate samples as they came from the device, shape (n, n_axes): int32 counts, or float32 where the device sends those.
 RateCounts = NDArray[np.int32] | NDArray[np.float32]
+
+
+#: Names of what may go wrong on any link, see `Gyro.troubles`.
+REPEATED, DAMAGED = "requests repeated", "damaged frames"
 
 
 class Clock(Protocol):
@@ -211,6 +216,13 @@ class Gyro(Protocol):
     def n_axes(self) -> int:
         """How many input axes a sample holds, 1 or 3, known after `connect`."""
 
+    @property
+    def troubles(self) -> Mapping[str, int]:
+        """What has gone wrong on the link and been made up for, how often since it was opened, by its name.
+
+        Such as REPEATED or DAMAGED; what is zero may be left out.
+        """
+
     def connect(self) -> DeviceIdentity:
         """Open a session: identify, check the protocol version, configure. Blocks up to a few seconds.
 
@@ -248,6 +260,10 @@ class Stage(Protocol):
     @property
     def limits(self) -> StageLimits:
         """Where the stage may be sent, known after `connect`."""
+
+    @property
+    def troubles(self) -> Mapping[str, int]:
+        """What has gone wrong on the link and been made up for, as that of a gyro."""
 
     def connect(self) -> DeviceIdentity:
         """Open a session. Blocks up to a few seconds; never moves."""

@@ -7,6 +7,7 @@ and no address: whoever puts a bench together makes them.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Protocol
 
 from drivers.api import Clock, DeviceIdentity, SelfTest, StageLimits, StageMode, StageState
@@ -41,6 +42,11 @@ class FixedMount:
         reach = 0.0 if self._operator is None else 2.0 * math.pi
         speed = math.inf if self._operator is None else HAND_SPEED
         return StageLimits(azimuth_min=-reach, azimuth_max=reach, elevation_min=0.0, elevation_max=0.0, max_speed=speed)
+
+    @property
+    def troubles(self) -> Mapping[str, int]:
+        """None: there is no link."""
+        return {}
 
     def connect(self) -> DeviceIdentity:
         """Say what it is."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
-from drivers.api import ByteLink, Clock
+from drivers.api import DAMAGED, REPEATED, ByteLink, Clock
 from drivers.errors import DeviceTimeoutError, LinkError, ProtocolError
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
 
@@ -63,7 +63,7 @@ class FrameStream:
         self._pending: list[bytes] = []
         self._n_pending = 0
         self._pending_since = 0.0
-        self._n_bytes = 0
+        self._n_bytes = self._n_repeated = 0
         self._lost: LinkError | None = None
         self._counts = decoder.counts
 
@@ -71,6 +71,12 @@ class FrameStream:
     def counts(self) -> CrcFrameCounts:
         """What the decoder has met."""
         return self._decoder.counts
+
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong and been made up for, as `drivers.api.Gyro.troubles`."""
+        counts = self.counts
+        return {REPEATED: self._n_repeated, DAMAGED: counts.n_bad_crc, "bytes skipped": counts.n_skipped}
 
     @property
     def holds(self) -> bool:
@@ -149,7 +155,8 @@ class FrameStream:
             If the link is lost.
         """
         n_bytes, n_frames = self._n_bytes, self.counts.n_frames
-        for _ in range(attempts):
+        for attempt in range(attempts):
+            self._n_repeated += attempt > 0
             self.link.write(question)
             deadline = self._clock.now() + patience
             while True:

@@ -15,7 +15,18 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
 
-from drivers.api import Clock, DeviceIdentity, Gyro, RateBlock, Stage, StageLimits, StageMode, StageState
+from drivers.api import (
+    REPEATED,
+    Clock,
+    DeviceIdentity,
+    Gyro,
+    GyroStatus,
+    RateBlock,
+    Stage,
+    StageLimits,
+    StageMode,
+    StageState,
+)
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError
 from northfinder.cyclogram import Standing, Step, reachable_azimuth
 from northfinder.errors import NorthFinderError, SequenceError
@@ -83,6 +94,7 @@ HOME_TIMEOUT = 180.0
 SLEW_MARGIN = 10.0
 #: For how many times its dwells, and how long besides a step, a plan is given room on the disk; times in s.
 SPACE_FACTOR, SPACE_PER_STEP = 1.5, 30.0
+_OF_A_STEP = {State.SLEW, State.SETTLE, State.DWELL}
 #: What a stage latches when its host falls silent: the one fault that is expected after an interruption.
 HOST_SILENT = {"WATCHDOG", "HEARTBEAT"}
 
@@ -169,6 +181,10 @@ class Sequencer:
     _state: StageState | None = None
     _now: State = State.CONNECT
     _failure: Exception | None = None
+    _flagged: dict[tuple[str, str, str], int] = field(default_factory=dict)  #: blocks that the gyro flagged, as `_told`
+    _told: dict[tuple[str, str, str], int] = field(
+        default_factory=dict
+    )  #: kind of event, device, what: how often up to now
 
     def __post_init__(self) -> None:
         """Go on after what was done before."""
@@ -189,7 +205,10 @@ class Sequencer:
             while self._now in actions:
                 self.recorder.add_event("state", self._now.value)
                 self._report()
-                self._now = self._after(self._act(actions[self._now]))
+                number = f" {len(self.spans) + 1}" if self._now in _OF_A_STEP else ""
+                event = self._act(actions[self._now])
+                self._tell_troubles(f"{self._now.value}{number}")
+                self._now = self._after(event)
             self.recorder.add_event("state", self._now.value)
         finally:
             self._close()
@@ -207,6 +226,19 @@ class Sequencer:
         except (DeviceError, NorthFinderError) as failure:
             self._failure = failure
             return Event.FAILURE
+
+    def _tell_troubles(self, where: str) -> None:
+        """Record what has gone wrong since the last time and been made up for: gaps, repeated requests, and such."""
+        found = self._flagged | {("gap", "gyro", "samples missing"): self.recorder.n_lost}
+        for name, device in (("gyro", self.gyro), ("stage", self.stage)):
+            for what, n in ({} if device is None else device.troubles).items():
+                found["retry" if what == REPEATED else "link", name, what] = n
+        told, self._told = self._told, found
+        if self._now in {State.CONNECT, State.IDENTIFY}:
+            return  # a line may have been opened in the middle of a frame
+        for (kind, name, what), n in found.items():
+            if n > (before := told.get((kind, name, what), 0)):
+                self.recorder.add_event(kind, f"{name}, {where}: {what}: {n - before}")
 
     def _after(self, event: Event) -> State:
         try:
@@ -418,6 +450,8 @@ class Sequencer:
                 self._place = self._placed(blocks[0])
             for block in blocks:
                 self.recorder.add_block(block)
+                if block.status:
+                    self._note_flags(block.status)
                 self._newest = block
                 self._next_index = block.first_index + len(block.counts)
                 if first is not None and block.first_index < stop and self._next_index > first:
@@ -428,6 +462,11 @@ class Sequencer:
                 return
             if not blocks and state is before:  # else look again first: the devices wait for word of what has come
                 self.clock.wait(self.clock.now() + SERVICE_PERIOD)
+
+    def _note_flags(self, status: GyroStatus) -> None:
+        for flag in status:
+            key = ("status", "gyro", f"blocks flagged {str(flag.name).lower().replace('_', ' ')}")
+            self._flagged[key] = self._flagged.get(key, 0) + 1
 
     def _placed(self, block: RateBlock) -> StreamPlace:
         """Return where the stream that begins with `block` lies after what was done before."""

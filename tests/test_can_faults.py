@@ -98,8 +98,10 @@ def test_error_frames_point_to_the_bit_rate() -> None:
     """Where error frames come instead of answers the message asks for bit rate and cable."""
     bench = can_bench()
     bench.tap.to_host = lambda identifier, data: [(1 << 29 | 8, bytes(8))]  # noqa: ARG005  # all is damaged
+    gyro = bench.open_gyro()
     with pytest.raises(DeviceTimeoutError, match="error frames came: is the bit rate right"):
-        bench.open_gyro().connect()
+        gyro.connect()
+    assert gyro.troubles["errors on the bus"] > 0
 
 
 def test_a_stray_answer_holds_up_no_wait() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from served import near_home
 
-from drivers.api import GyroStatus, RateBlock
+from drivers.api import DAMAGED, GyroStatus, RateBlock
 from drivers.epson import EpsonGyro, open_gyro
 from drivers.epson.recognise import RECOGNISER
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
@@ -151,6 +151,7 @@ def test_a_noisy_line_loses_samples_but_never_alters_one(seed: int) -> None:
         break
     blocks = bench.stream(30.0)
     assert sum(block.n_lost for block in blocks) > 0
+    assert bench.gyro.troubles[DAMAGED] > 0
     last = blocks[-1].first_index + len(blocks[-1].counts)
     assert sum(block.n_lost + len(block.counts) for block in blocks) == last
     shift = _shift(clean, blocks[0])

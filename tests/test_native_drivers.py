@@ -13,7 +13,7 @@ from golden import GOLDEN, SESSION
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.api import Gyro, GyroStatus, RateBlock, Stage, StageLimits, StageMode, StageState
+from drivers.api import REPEATED, Gyro, GyroStatus, RateBlock, Stage, StageLimits, StageMode, StageState
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
 from drivers.native import NativeGyro, NativeStage
 from drivers.native.session import MAX_STREAM
@@ -283,6 +283,7 @@ def test_a_request_is_executed_once_whatever_is_lost() -> None:
     bench.serve(lambda state: state.in_position)
     states = [parse(body) for body in bench.stage_tap.said if body[0] == MessageType.STAGE_STATUS]
     assert len({state.move_id for state in states}) == 3  # none, the homing, this move
+    assert bench.stage.troubles[REPEATED] == 3
 
 
 def test_replies_that_come_twice_confuse_nothing() -> None:

@@ -1,16 +1,19 @@
 """The sequence on the emulated bench: what it does and records, and how every failure ends with the stage at rest."""
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from virtual import Noted, VirtualBench, virtual_bench
 
-from drivers.api import StageLimits, StageMode
+from drivers.api import REPEATED, Stage, StageLimits, StageMode
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError
 from drivers.native import NativeStage
 from drivers.transport.virtual import VirtualLink
@@ -19,6 +22,8 @@ from northfinder.errors import ConfigError, RecordError
 from northfinder.record import Record
 from northfinder.record.recorder import Recorder
 from northfinder.sequencer import TRANSITIONS, Event, Progress, Sequencer, State, StopRequestedError
+from sim_device.bench import SimBench
+from sim_device.plant.profile import load_profile
 
 #: The six positions in ten seconds each.
 SHORT = six_position(10.0)
@@ -191,6 +196,60 @@ def test_lost_frames_are_counted_and_survived(tmp_path: Path) -> None:
     n_received = sum(len(block.counts) for block in blocks)
     end = blocks[-1].first_index + len(blocks[-1].counts)
     assert end - blocks[0].first_index - n_received == sum(block.n_lost for block in blocks[1:])
+
+
+class AskedAgain:
+    """A stage that had to be asked three times for each move."""
+
+    def __init__(self, stage: NativeStage) -> None:
+        self._stage = stage
+        self.troubles = {REPEATED: 0}
+
+    def move(self, azimuth: float, elevation: float) -> None:
+        """Move, in the end."""
+        self.troubles = {REPEATED: self.troubles[REPEATED] + 2}
+        self._stage.move(azimuth, elevation)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401  # all else is the stage's
+        return getattr(self._stage, name)
+
+
+def test_what_goes_wrong_and_is_made_up_for_is_told(tmp_path: Path) -> None:
+    """Gaps, requests that had to be repeated and damaged frames stand among the events, each with its place."""
+    bench = virtual_bench(faults=("gyro:flip=0.00002",))
+    with sequencer(bench, tmp_path / "r.sqlite") as sequence:
+        sequence.open_stage = lambda: cast("Stage", AskedAgain(bench.open_stage()))
+        sequence.run()
+        n_lost = sequence.recorder.n_lost
+    with Record(tmp_path / "r.sqlite") as record:
+        told = [(kind, detail) for _, kind, detail in record.events()]
+    of_gyro = r"gyro, (?:slew|settle|dwell) [1-8]: "
+    gaps = [re.fullmatch(of_gyro + r"samples missing: (\d+)", detail) for kind, detail in told if kind == "gap"]
+    assert sum(int(gap[1]) for gap in gaps if gap) == n_lost > 0
+    assert all(gaps)
+    assert any(kind == "link" and re.fullmatch(of_gyro + r"damaged frames: \d+", detail) for kind, detail in told)
+    retries = [detail for kind, detail in told if kind == "retry"]
+    assert retries == [f"stage, slew {number}: requests repeated: 2" for number in range(1, 9)]
+
+
+def test_a_sound_bench_has_nothing_to_tell(tmp_path: Path) -> None:
+    """No trouble is made up where there is none."""
+    with sequencer(virtual_bench(), tmp_path / "r.sqlite") as sequence:
+        sequence.run()
+    with Record(tmp_path / "r.sqlite") as record:
+        assert {kind for _, kind, _ in record.events()} == {"state", "self-test"}
+
+
+def test_flagged_blocks_are_told(tmp_path: Path) -> None:
+    """Blocks that the gyro declares unfit stand among the events."""
+    profile = load_profile("tvg43")
+    bench = VirtualBench(SimBench(replace(profile, gyro=replace(profile.gyro, range_dph=30.0)), seed=1))
+    with sequencer(bench, tmp_path / "r.sqlite") as sequence:
+        sequence.run()
+    with Record(tmp_path / "r.sqlite") as record:
+        flagged = [detail for _, kind, detail in record.events() if kind == "status"]
+    assert flagged
+    assert all(re.fullmatch(r"gyro, \w+ [1-8]: blocks flagged saturated: \d+", detail) for detail in flagged)
 
 
 def test_an_unreachable_plan_is_refused_before_anything_moves(tmp_path: Path) -> None:

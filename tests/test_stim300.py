@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from streaming import TriadBoard, Wire
 
-from drivers.api import Gyro, GyroStatus, RateBlock
+from drivers.api import DAMAGED, REPEATED, Gyro, GyroStatus, RateBlock
 from drivers.errors import DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
 from drivers.protocol.crc_frames import Frames, checksum
 from drivers.protocol.stim300 import (
@@ -400,12 +400,16 @@ class TestDriver:
         rig = Rig()
         rig.board.rates = [(225 * i, 0, 0) for i in range(1000)]
         rig.started()
-        first = None
+        first, n_damaged = None, 0
 
         def hurt(data: bytes) -> bytes:
+            nonlocal n_damaged
             if not data or rng.random() >= share:
                 return data
-            return b"" if rng.random() < 0.5 else data[:9] + bytes([data[9] ^ 1]) + data[10:]
+            if rng.random() < 0.5:
+                return b""
+            n_damaged += 1
+            return data[:9] + bytes([data[9] ^ 1]) + data[10:]
 
         rig.wire.damage = hurt
         n_lost = n = 0
@@ -416,6 +420,7 @@ class TestDriver:
             n_lost += block.n_lost
             n += len(values)
         assert n + n_lost == block.first_index + len(block.counts)
+        assert (rig.gyro.troubles[DAMAGED] > 0) == (n_damaged > 0)
 
     @pytest.mark.parametrize("gap", [0.05, 0.128, 0.3, 0.9])
     def test_gaps_longer_than_the_counter(self, gap: float) -> None:
@@ -534,6 +539,7 @@ class TestDriver:
         rig.wire.damage = spoil
         assert rig.gyro.connect().serial_number == "N25581846020021"
         assert len(spoilt) == 3
+        assert rig.gyro.troubles[REPEATED] == 3
 
 
 class TestSettings:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from served import near_home
 
-from drivers.api import StageLimits, StageMode, StageState
+from drivers.api import DAMAGED, StageLimits, StageMode, StageState
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, LinkError, ProtocolError
 from drivers.protocol.zaber import checksum
 from drivers.transport.virtual import VirtualClock, VirtualLink
@@ -385,6 +385,7 @@ def test_a_damaged_line_never_misleads(seed: int) -> None:
     state = bench.serve(lambda state: state.in_position)
     assert bench.angles_deg() == pytest.approx([45, -20], abs=1e-3)
     assert [degrees(state.azimuth), degrees(state.elevation)] == pytest.approx([45, -20], abs=1e-3)
+    assert bench.stage.troubles[DAMAGED] > 0
 
 
 @pytest.mark.parametrize(

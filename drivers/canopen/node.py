@@ -15,7 +15,7 @@ from canopen.emcy import EmcyError
 from canopen.objectdictionary.eds import import_eds
 from numpy.typing import NDArray
 
-from drivers.api import Clock, FrameLink
+from drivers.api import DAMAGED, REPEATED, BusCounts, Clock, FrameLink
 from drivers.canopen.network import LinkNetwork, LinkNode
 from drivers.canopen.objects import Objects
 from drivers.canopen.pdo import PdoCodec
@@ -84,6 +84,16 @@ class Node:
     def name(self) -> str:
         """Device, number and bus, for messages: ``the gyro, node 16 on socketcan:can0``."""
         return f"the {self._title}, node {self.id} on {self._link.name}"
+
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong with this node and been made up for, as `drivers.api.Gyro.troubles`."""
+        return {REPEATED: self.objects.n_repeated, DAMAGED: self.n_malformed}
+
+    @property
+    def bus(self) -> BusCounts:
+        """What has been heard on the bus, by all that listen there."""
+        return self._link.counts
 
     # What arrives
 
@@ -225,7 +235,7 @@ class Node:
 
     def _unheard(self) -> DeviceTimeoutError:
         """Return the exception for a node that does not answer, with what was heard on the bus instead."""
-        counts = self._link.counts
+        counts = self.bus
         nodes = sorted({identifier & 0x7F for identifier in counts.identifiers if identifier & 0x7F})
         if counts.n_errors:
             heard = f"{counts.n_errors} error frames came: is the bit rate right, and the cable whole?"

@@ -31,6 +31,7 @@ class Objects:
     def __init__(self, remote: LinkNode, name: str) -> None:
         self.name = name
         self._remote = remote
+        self.n_repeated = 0  #: transfers that were begun again because nothing had answered
 
     def read(self, index: int, subindex: int = 0) -> int:
         """Return the value of a number.
@@ -83,7 +84,8 @@ class Objects:
 
     def _transfer(self, what: str, transfer: Callable[[], T]) -> T:
         """Run a transfer, up to three times if nothing answers; turn canopen's exceptions into ours."""
-        for _ in range(_ATTEMPTS):
+        for attempt in range(_ATTEMPTS):
+            self.n_repeated += attempt > 0
             self._remote.sdo.n_answers = 0
             try:
                 return transfer()

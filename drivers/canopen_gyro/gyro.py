@@ -93,6 +93,11 @@ class CanopenGyro:
         """Frames with the node's identifiers that were of another length than their own."""
         return self._node.n_malformed
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong with the node and on the bus, which others share, and been made up for."""
+        return {**self._node.troubles, "errors on the bus": self._node.bus.n_errors}
+
     def connect(self) -> DeviceIdentity:
         """Stop the node, check what it is, configure it, and start it.
 

@@ -76,6 +76,12 @@ class Cia402Stage:
             raise LinkError(f"the limits of {self._names} are known after connect")
         return self._limits
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong with either node and been made up for."""
+        azimuth, elevation = (axis.node.troubles for axis in self._axes)
+        return {what: n + elevation[what] for what, n in azimuth.items()}
+
     def connect(self) -> DeviceIdentity:
         """Meet both drives, bring them to rest, configure them. Never moves.
 

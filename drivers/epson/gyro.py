@@ -66,6 +66,11 @@ class EpsonGyro:
         """Bursts with a right sum but an impossible counter."""
         return self._counter.n_dropped
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong on the link and been made up for."""
+        return self._stream.troubles if self._stream else {}
+
     def connect(self) -> DeviceIdentity:
         """End sampling, ask who it is, and set rate, filter, burst and automatic sending.
 

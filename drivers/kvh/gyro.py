@@ -80,6 +80,11 @@ class KvhGyro:
         """What has come over the link, and what of it could not be used."""
         return self._stream.counts
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong on the link and been made up for."""
+        return self._stream.troubles
+
     def connect(self) -> DeviceIdentity:
         """Ask the unit in configuration mode what it is set to, and look which of its axes are there.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from construct import Container
 
-from drivers.api import ByteLink, Clock, DeviceIdentity
+from drivers.api import DAMAGED, REPEATED, ByteLink, Clock, DeviceIdentity
 from drivers.errors import DeviceTimeoutError, LinkError, ProtocolError
 from drivers.native.greeting import KIND_NAMES, hello, identity, no_answer
 from drivers.native.refusal import refusal
@@ -40,6 +40,7 @@ def _span(kind: MessageType, name: str) -> slice:
 
 
 _MAX_REPLIES = 16  # only the one to the last request matters
+_TAKES_TIME = {MessageType.SELF_TEST}  # answered late: to ask again is no trouble
 _STREAM_TYPES = (MessageType.SAMPLES, MessageType.STAGE_STATUS)
 _SESSION_SPAN = {kind: _span(kind, "session") for kind in _STREAM_TYPES}
 _TIME_SPAN = {kind: _span(kind, "device_time_us") for kind in _STREAM_TYPES}
@@ -98,7 +99,7 @@ class Session:
         self._seen_us = 0
         self._beaten_us = 0
         self._beaten_at = 0.0
-        self._n_bytes = self._n_unknown = self._n_foreign = 0
+        self._n_bytes = self._n_unknown = self._n_foreign = self._n_repeated = 0
 
     @property
     def name(self) -> str:
@@ -114,6 +115,13 @@ class Session:
     def counts(self) -> LinkCounts:
         """What has come that could not be used."""
         return LinkCounts(self._decoder.counts, self._n_bytes, self._n_unknown, self._n_foreign)
+
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong and been made up for, as `drivers.api.Gyro.troubles`."""
+        frames = self._decoder.counts
+        n_damaged = frames.n_bad_cobs + frames.n_bad_crc + frames.n_too_long
+        return {REPEATED: self._n_repeated, DAMAGED: n_damaged, "unknown messages": self._n_unknown}
 
     @property
     def silence(self) -> float:
@@ -177,7 +185,10 @@ class Session:
         self._request_id += 1
         number = self._request_id
         frame = encode_frame(build(kind, session=self._number, request_id=number, **fields))
+        n_repeated = self._n_repeated
         answer = self._exchange(frame, lambda message: message.get("request_id") == number, interval, attempts)
+        if kind in _TAKES_TIME:
+            self._n_repeated = n_repeated
         if answer is None:
             raise DeviceTimeoutError(
                 f"{self.name} did not answer {kind.name} within {interval * attempts:.1f} s, asked {attempts} times"
@@ -267,7 +278,8 @@ class Session:
     ) -> Container | None:
         """Send `frame` up to `attempts` times, `interval` apart, until a message comes that `answers` it."""
         self._replies.clear()
-        for _ in range(attempts):
+        for attempt in range(attempts):
+            self._n_repeated += attempt > 0
             self._link.write(frame)
             for message in self._listen(self._clock.now() + interval):
                 if answers(message):

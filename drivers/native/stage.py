@@ -82,6 +82,11 @@ class NativeStage:
         """What has come over the link that could not be used."""
         return self._session.counts
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong on the link and been made up for."""
+        return self._session.troubles
+
     def connect(self) -> DeviceIdentity:
         """Open a session, read the limits and the first state. Never moves; brings a moving stage to rest.
 

@@ -98,6 +98,11 @@ class Stim300Gyro:
         """What has come over the link, and what of it could not be used."""
         return self._stream.counts
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong on the link and been made up for."""
+        return self._stream.troubles
+
     def connect(self) -> DeviceIdentity:
         """Ask the unit for its part number, serial number and configuration; change this only if told to.
 

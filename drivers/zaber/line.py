@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.api import ByteLink, Clock
+from drivers.api import DAMAGED, REPEATED, ByteLink, Clock
 from drivers.errors import DeviceFaultError, DeviceTimeoutError, ProtocolError
 from drivers.protocol.zaber import N_IDS, REJECTIONS, Alert, LineCounts, LineDecoder, Reply, encode_command
 
@@ -42,7 +42,7 @@ class Line:
         self._next_id = 0
         self._asked: dict[int, Target] = {}
         self._answers: dict[int, Reply] = {}
-        self._n_foreign = 0
+        self._n_foreign = self._n_repeated = 0
         self.alerted = False  #: whether an axis has said something unasked since this was last reset
 
     @property
@@ -59,6 +59,11 @@ class Line:
     def n_foreign(self) -> int:
         """Replies that answered no open question."""
         return self._n_foreign
+
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong and been made up for, as `drivers.api.Gyro.troubles`."""
+        return {REPEATED: self._n_repeated, DAMAGED: self.counts.n_bad_sum + self.counts.n_malformed}
 
     def require_sums(self) -> None:
         """Take only lines with a checksum from now on."""
@@ -106,7 +111,8 @@ class Line:
         LinkError
             If the link is lost.
         """
-        for _ in range(attempts):
+        for attempt in range(attempts):
+            self._n_repeated += attempt > 0
             number = self.send(target, command)
             deadline = self._clock.now() + interval
             while True:

@@ -68,6 +68,11 @@ class ZaberStage:
         """What has come over the line."""
         return self._line.counts
 
+    @property
+    def troubles(self) -> dict[str, int]:
+        """What has gone wrong on the link and been made up for."""
+        return self._line.troubles
+
     def connect(self) -> DeviceIdentity:
         """Meet the devices, read limits and flags. Never moves; brings a moving stage to rest.
 
