@@ -142,6 +142,6 @@ def test_a_failed_export_leaves_nothing(tmp_path: Path, kind: str) -> None:
     Recorder(empty, lambda: 1.0).close()
     with Record(empty) as record, pytest.raises(RecordError, match="holds no samples"):
         export_record(record, tmp_path / "out", kind)
-    with Record(path) as record, pytest.raises(RecordError, match="cannot be written"):
+    with Record(path) as record, pytest.raises(RecordError, match="cannot be made: File exists"):
         export_record(record, tmp_path / "there" / "out", kind)
     assert {file.name for file in tmp_path.iterdir()} == {"r.sqlite", "there", "empty.sqlite"}

@@ -132,6 +132,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     try:
         code = cli.main(arguments, standalone_mode=False)
     except click.exceptions.Abort:
+        _complain("northfinder: interrupted")
         code = EXIT_INTERRUPTED
     except click.ClickException as error:
         error.show()

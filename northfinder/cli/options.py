@@ -10,6 +10,8 @@ import click
 
 Command = Callable[..., Any]
 
+#: A file that the command itself reads: whether it can, its reader says, with the exit code that goes with it.
+FILE = click.Path(path_type=Path, readable=False)
 #: Values of --method.
 METHODS = ("generalised", "ordinary")
 

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import click
 
+from northfinder.cli.ending import tidied_up
+from northfinder.cli.options import FILE
 from northfinder.cli.show import print_json
 from northfinder.record.recovery import recover
 from northfinder.text import printable
 
 
 @click.command("recover")
-@click.argument("record", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), metavar="FILE", help="By default RECORD with -recovered.")
+@click.argument("record", type=FILE)
+@click.option("-o", "--out", type=FILE, metavar="FILE", help="By default RECORD with -recovered.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output.")
 def command(*, record: Path, out: Path | None, as_json: bool) -> None:
     """Save every sound row of a torn or damaged RECORD to a new one, and say what is lost.
@@ -23,9 +25,11 @@ def command(*, record: Path, out: Path | None, as_json: bool) -> None:
 
     \b
       northfinder recover records/north-20260101T120000.000000Z.sqlite
+      northfinder recover records/north-20260101T120000.000000Z.sqlite --out saved.sqlite --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
     out = out or record.with_name(f"{record.stem}-recovered{record.suffix}")
-    salvage = recover(record, out)
+    with tidied_up():
+        salvage = recover(record, out)
     if as_json:
         print_json({"record": str(out), "found": salvage.found, "lost": salvage.lost, "closed": salvage.closed})
         return

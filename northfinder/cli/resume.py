@@ -16,6 +16,7 @@ from northfinder.cli.aside import Aside
 from northfinder.cli.bench import stop_on_signal
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.find import planned_gyro, stage_opener
+from northfinder.cli.options import FILE
 from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.config import Config, StageTable, read_config
 from northfinder.errors import ConfigError
@@ -26,7 +27,7 @@ from northfinder.solve_file import kept_bearings
 
 
 @click.command("resume")
-@click.argument("file", type=click.Path(path_type=Path), metavar="RECORD")
+@click.argument("file", type=FILE, metavar="RECORD")
 @click.option("--gyro", "gyro_address", metavar="DRIVER:ADDRESS", help="If not where it was.")
 @click.option("--stage", "stage_address", metavar="DRIVER:ADDRESS", help="If not where it was.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), metavar="FILE", help="A bench as TOML.")

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import msgspec
 from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
@@ -15,7 +14,7 @@ from rich.text import Text
 from northfinder.angles import direction_text
 from northfinder.budget_report import largest
 from northfinder.errors import EstimateError
-from northfinder.text import printable
+from northfinder.text import json_text, printable
 
 #: A note longer than this is cut.
 _MAX_NOTE = 500
@@ -23,7 +22,7 @@ _MAX_NOTE = 500
 
 def print_json(value: object) -> None:
     """Print `value` as one line of JSON."""
-    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
+    sys.stdout.write(json_text(value) + "\n")
     sys.stdout.flush()
 
 

@@ -12,6 +12,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from northfinder.cli.options import FILE
 from northfinder.cli.records import safe, utc_text, with_sd
 from northfinder.cli.show import print_json
 from northfinder.record.summary import page
@@ -20,7 +21,7 @@ _MAX_EVENTS = 200
 
 
 @click.command("show")
-@click.argument("record", type=click.Path(path_type=Path))
+@click.argument("record", type=FILE)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on standard output, with all that there is.")
 def command(*, record: Path, as_json: bool) -> None:
     """Show what RECORD holds: devices, plan, steps, events, notes and fix.

@@ -12,9 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from northfinder.calibration import read_calibration
-from northfinder.cli.options import estimation_options, position_options
+from northfinder.cli.options import FILE, estimation_options, position_options
 from northfinder.cli.show import print_json, print_result, require_trustworthy
 from northfinder.geodesy import Place
+from northfinder.record.files import require_file
 from northfinder.solution import Assumptions, Method
 from northfinder.solve_file import solve_file
 from northfinder.text import printable
@@ -26,7 +27,7 @@ _REVISED = {name: name for name in ("latitude_deg", "latitude_sd_deg", "profile"
 
 
 @click.command("solve")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=FILE)
 @click.option(
     "--input-axis-offset",
     "offset_deg",
@@ -61,6 +62,7 @@ def command(
       northfinder solve dwells.csv --latitude 49 --input-axis-offset 180
       northfinder solve triad.csv --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
+    require_file(file)
     options = Assumptions.gather(
         profile=profile,
         latitude_deg=latitude_deg,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,6 +16,7 @@ from northfinder.errors import RecordError
 from northfinder.export.mat import write_array, write_header, write_text
 from northfinder.export.samples import Column, sample_batches, step_table
 from northfinder.record import Record
+from northfinder.record.files import new_file
 
 #: Bytes copied at a time.
 _PIECE = 1 << 20
@@ -26,19 +27,8 @@ def export_record(record: Record, out: Path, kind: str) -> int:
 
     Raises RecordError if `out` exists or cannot be written, or the record is damaged; nothing is left behind then.
     """
-    if out.exists():
-        raise RecordError(f"{out} exists already: nothing is overwritten")
-    part = out.with_name(out.name + ".part")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        n_samples = FORMATS[kind](record, part)
-        part.rename(out)
-    except OSError as error:
-        raise RecordError(f"{out} cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-    return n_samples
+    with new_file(out) as part:
+        return FORMATS[kind](record, part)
 
 
 def about(record: Record) -> str:
@@ -62,14 +52,16 @@ def _csv(record: Record, out: Path) -> int:
     from pyarrow import csv  # noqa: PLC0415  # dear to import
 
     options = csv.WriteOptions(quoting_style="none")
-    return _arrow(record, lambda schema: csv.CSVWriter(out, schema, write_options=options))
+    with out.open("wb") as file:  # Arrow knows no names but Unicode
+        return _arrow(record, lambda schema: csv.CSVWriter(file, schema, write_options=options))
 
 
 def _parquet(record: Record, out: Path) -> int:
     from pyarrow import parquet  # noqa: PLC0415  # dear to import
 
     kept = {"northfinder": about(record)}
-    return _arrow(record, lambda schema: parquet.ParquetWriter(out, schema.with_metadata(kept)), kept)
+    with out.open("wb") as file:
+        return _arrow(record, lambda schema: parquet.ParquetWriter(file, schema.with_metadata(kept)), kept)
 
 
 def _arrow(record: Record, writer_of: Callable[[Any], Any], metadata: dict[str, str] | None = None) -> int:

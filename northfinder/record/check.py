@@ -105,5 +105,5 @@ def _examine_end(db: sqlite3.Connection, last: dict[str, int], found: Examinatio
     if counts is not None:
         short = [table for table, number in counts.items() if last.get(table, 0) < number]
         found.damage += [f"{table} ends at row {last[table]} of {counts[table]}" for table in short if table in last]
-    if not last["fix"]:
+    if not last["fix"] and not written:
         found.notes.append("the measurement ended early: northfinder resume goes on with it")

@@ -48,7 +48,7 @@ def _locked(path: Path) -> int | None:
     """Return a handle that holds the lock, None where there are no locks. Raises BlockingIOError if it is taken."""
     if fcntl is None:
         return None
-    file = os.open(path, os.O_RDONLY)
+    file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe is not waited for
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

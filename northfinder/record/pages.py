@@ -12,10 +12,12 @@ import os
 import re
 import struct
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 from northfinder.errors import RecordError
+from northfinder.record.files import has_log, log_of
 from northfinder.record.schema import MAX_ROW_BYTES, PAGE_SIZE, TABLES, Row, is_sound
 
 _WAL_HEADER, _FRAME_HEADER = 32, 24  # bytes
@@ -38,15 +40,15 @@ FetchPage = Callable[[int], bytes]
 def scan(path: Path) -> Iterator[tuple[str, Row]]:
     """Yield (table, row) of all sound rows in the file `path` and its log, in the order of the pages.
 
-    A row may come several times. Raises RecordError if the file cannot be read.
+    A row may come several times; of a file that is gone its log alone is read. Raises RecordError if they cannot be.
     """
-    log = path.with_name(path.name + "-wal")
+    logged = has_log(path)
     try:
-        with path.open("rb") as file:
-            if not log.is_file():
+        with BytesIO() if logged and not path.exists() else path.open("rb") as file:
+            if not logged:
                 yield from _scan_file(file, _fetcher(file, None, {}))
                 return
-            with log.open("rb") as wal:
+            with log_of(path).open("rb") as wal:
                 fetch = _fetcher(file, wal, _frames(wal))
                 yield from _scan_file(file, fetch)
                 yield from _scan_log(wal, fetch)

@@ -22,6 +22,7 @@ import numpy as np
 from drivers.api import GyroStatus, RateBlock, RateCounts, StageMode, StageState
 from northfinder.errors import RecordError
 from northfinder.record.block_columns import BlockColumns
+from northfinder.record.files import has_log, log_of, require_file
 from northfinder.record.schema import (
     APPLICATION_ID,
     MAX_BLOCK_BYTES,
@@ -38,6 +39,10 @@ _ALL_STATUS = sum(GyroStatus)
 _STATUS = {int(status): status for status in (GyroStatus.OK, GyroStatus.OVERRUN)}  # the usual ones, quickly
 _ANY_INDEX = (0, 1 << 62)
 _FETCHED = 64  # rows at a time
+#: How a file of SQLite begins, and where it says whose it is.
+_SQLITE, _APPLICATION_ID, _HEADER_BYTES = b"SQLite format 3\0", slice(68, 72), 100
+#: Samples a second, numbers of streams and steps, times in s and angles in rad, beyond which nothing can be meant.
+_SAMPLE_RATES, _MAX_NUMBER, _MAX_REAL = (1e-3, 1e7), 1 << 31, 1e12
 #: The entry of meta that a closed record has: how many rows each table held before it, but for notes.
 CLOSED = "closed"
 
@@ -89,24 +94,57 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
 
     Raises RecordError if it is no record of a version this program knows.
     """
-    if not path.is_file():
-        raise RecordError(f"no record {path}: expected a file")
+    require_file(path)
     with one_line(path, "read"):
         db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_ROW_BYTES)
         try:
             application_id, version = _kind(db, path)
-        except sqlite3.OperationalError:  # it could be one, but not here: no rights, no room beside it
+        except sqlite3.OperationalError as error:  # it could be one, but not here: no rights, no room beside it
             db.close()
+            if error.sqlite_errorcode == sqlite3.SQLITE_CANTOPEN and has_log(path):
+                raise _log_locked_up(path) from None
             raise
-        except (sqlite3.DatabaseError, UnicodeError):
+        except (sqlite3.DatabaseError, UnicodeError) as error:
             db.close()
-            raise RecordError(f"{path} is no record of a measurement") from None
+            raise _unreadable(path, error) from None
+    if application_id == 0 and not path.stat().st_size:
+        db.close()
+        raise RecordError(f"{path} is no record of a measurement: it is empty")
     if application_id != APPLICATION_ID or version != SCHEMA_VERSION:
         db.close()
         found = f"version {version}" if application_id == APPLICATION_ID else "another kind of SQLite file"
         raise RecordError(f"{path} is no record of version {SCHEMA_VERSION}: found {found}")
+    if (program := _program_in(db)) is not None:
+        db.close()
+        raise RecordError(f"{path} is no record of a measurement: found {program} in it, expected plain tables alone")
     return db
+
+
+def _program_in(db: sqlite3.Connection) -> str | None:
+    """Return what a database holds beside tables that would run when it is read or written, None if nothing."""
+    query = "SELECT type, name FROM sqlite_master WHERE type IN ('view', 'trigger') OR sql LIKE 'CREATE VIRTUAL%'"
+    try:
+        found = db.execute(query).fetchone()
+    except (sqlite3.Error, UnicodeError):
+        return None  # damaged: whoever reads the tables will say so
+    return None if found is None else f"the {found[0]} {found[1]}"
+
+
+def _log_locked_up(path: Path) -> RecordError:
+    return RecordError(
+        f"the record {path} cannot be read: its newest rows stand in {log_of(path).name}, and SQLite must write beside "
+        "it to read them: copy both to where that is allowed, or northfinder recover --out elsewhere"
+    )
+
+
+def _unreadable(path: Path, error: Exception) -> RecordError:
+    """Return what to say of a file that SQLite does not take for a database: its header may still be a record's."""
+    with path.open("rb") as file:
+        header = file.read(_HEADER_BYTES)
+    if header.startswith(_SQLITE) and header[_APPLICATION_ID] == APPLICATION_ID.to_bytes(4, "big"):
+        return RecordError(f"the record {path} is damaged: {error}; northfinder recover saves the rest")
+    return RecordError(f"{path} is no record of a measurement")
 
 
 def _kind(db: sqlite3.Connection, path: Path) -> tuple[int, int]:
@@ -208,17 +246,27 @@ class Record:
 
     def streams(self) -> list[StreamInfo]:
         """Return the streams of the gyro in order; none if the measurement ended before."""
-        return [
+        streams = [
             StreamInfo(
                 stream=stream, utc=utc, clock=clock, sample_rate=sample_rate, n_axes=n_axes,
                 identities=self._decoded(identities, f"the identities of stream {stream}"), software=software,
             )
             for _, stream, utc, clock, sample_rate, n_axes, identities, software in self.rows("stream")
         ]  # fmt: skip
+        for number, info in enumerate(streams, 1):
+            if not (_is_possible(info) and 0 < info.n_axes < _MAX_NUMBER):
+                raise self._damaged(f"row {number} of stream is no stream of samples")
+        return streams
 
     def steps(self) -> list[DwellSpan]:
         """Return the finished dwells in order."""
-        return [DwellSpan(**dict(zip(DwellSpan.__slots__, row[1:], strict=True))) for row in self.rows("step")]
+        spans = [DwellSpan(**dict(zip(DwellSpan.__slots__, row[1:], strict=True))) for row in self.rows("step")]
+        for number, span in enumerate(spans, 1):
+            possible = 0 <= span.first_index < span.stop_index <= _ANY_INDEX[1] and 0 <= span.step < _MAX_NUMBER
+            possible = possible and 0 <= span.turn_on < _MAX_NUMBER
+            if not (possible and _is_possible(span)):
+                raise self._damaged(f"row {number} of step is no dwell")
+        return spans
 
     def blocks(
         self, first_index: int = _ANY_INDEX[0], stop_index: int = _ANY_INDEX[1], *, stream: int | None = None
@@ -335,6 +383,13 @@ class Record:
     def fixes(self) -> list[Any]:
         """Return what was estimated, oldest first."""
         return [self._decoded(value, f"fix {number}") for number, _, value in self.rows("fix")]
+
+
+def _is_possible(stated: DwellSpan | StreamInfo) -> bool:
+    """Return whether the number of the stream, its sample rate, and all times and angles can be what they say."""
+    reals = (getattr(stated, name) for name in stated.__slots__ if isinstance(getattr(stated, name), float))
+    rate_can_be = _SAMPLE_RATES[0] <= stated.sample_rate <= _SAMPLE_RATES[1]
+    return rate_can_be and 0 <= stated.stream < _MAX_NUMBER and all(abs(real) <= _MAX_REAL for real in reals)
 
 
 def _number(value: float | None) -> float:

@@ -13,7 +13,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import numpy as np
 
 from drivers.api import DeviceIdentity, RateBlock, StageState
@@ -21,6 +20,7 @@ from northfinder.errors import RecordError
 from northfinder.record import writer
 from northfinder.record.reader import CLOSED, DwellSpan, Record
 from northfinder.record.schema import MAX_BLOCK_BYTES, TABLES, Row, sealed
+from northfinder.text import json_text
 
 #: What has arrived is handed to the file at least this often, in s.
 WRITE_PERIOD = 0.1
@@ -95,13 +95,13 @@ class Recorder:
 
     def set_meta(self, key: str, value: object) -> None:
         """Keep `value`, anything that can be JSON, under `key`."""
-        self._put("meta", key, msgspec.json.encode(value).decode())
+        self._put("meta", key, json_text(value))
 
     def begin_stream(
         self, identities: Mapping[str, DeviceIdentity], *, sample_rate: float, n_axes: int, software: str = ""
     ) -> None:
         """Keep that the gyro starts a stream now, and from what."""
-        value = msgspec.json.encode(dict(identities)).decode()
+        value = json_text(dict(identities))
         self._put("stream", self.stream, self.now(), self._clock(), sample_rate, n_axes, value, software)
 
     def add_block(self, block: RateBlock) -> None:
@@ -141,7 +141,7 @@ class Recorder:
 
     def add_fix(self, value: object) -> None:
         """Keep what was estimated."""
-        self._put("fix", self.now(), msgspec.json.encode(value).decode())
+        self._put("fix", self.now(), json_text(value))
 
     def _row(self, table: str, *values: Any) -> Row:  # noqa: ANN401  # whatever the columns hold
         row = sealed(table, self._next_row[table], values)

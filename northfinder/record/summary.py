@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,10 @@ MAX_LISTED = 10_000
 def list_records(folder: Path) -> list[dict[str, Any]]:
     """Return a line for each record in `folder`, the newest first. Raises RecordError if the folder cannot be read."""
     try:
-        paths = sorted(folder.glob("*.sqlite"), key=lambda path: path.name, reverse=True)
+        found = sorted((path for path in folder.iterdir() if path.suffix == ".sqlite"), reverse=True)
     except OSError as error:
-        raise RecordError(f"{folder}: cannot be read: {error.strerror}") from None
-    if not folder.is_dir():
-        raise RecordError(f"no folder {folder}: expected one with records")
-    return [summary(path) for path in paths[:MAX_LISTED]]
+        raise RecordError(f"{folder} cannot be read: {error.strerror}, expected a folder with records") from None
+    return [summary(path) for path in found[:MAX_LISTED]]
 
 
 def newest_record(folder: Path) -> Path:
@@ -41,8 +40,10 @@ def summary(path: Path) -> dict[str, Any]:
     line: dict[str, Any] = {
         "record": str(path), "state": "damaged", "started_utc_s": None, "plan": None, "steps": None, "gyro": None,
         "azimuth_deg": None, "azimuth_sd_deg": None, "latitude_deg": None, "latitude_sd_deg": None, "n_notes": 0,
-        "size_bytes": path.stat().st_size if path.exists() else 0, "problem": None,
+        "size_bytes": 0, "problem": None,
     }  # fmt: skip
+    with suppress(OSError):
+        line["size_bytes"] = path.stat().st_size
     try:
         with Record(path) as record:
             return line | _facts(record, written=written)
@@ -54,17 +55,21 @@ def _facts(record: Record, *, written: bool) -> dict[str, Any]:
     events, fixes = record.events(), record.fixes()
     fix = fixes[-1] if fixes and isinstance(fixes[-1], dict) else {}
     names = ("azimuth_deg", "azimuth_sd_deg", "latitude_deg", "latitude_sd_deg")
-    identities, plan = record.meta("identities") or {}, record.meta("plan") or {}
-    gyro = identities.get("gyro") or {}
+    gyro = _entries(_entries(record.meta("identities")).get("gyro"))
     state = "being written" if written else "complete" if fixes else "ends early"
     return {
         "state": state,
         "started_utc_s": events[0][0] if events else None,
-        "plan": plan.get("name"),
+        "plan": _entries(record.meta("plan")).get("name"),
         "steps": completeness(record)["steps"],
         "gyro": f"{gyro.get('model', '')} {gyro.get('serial_number', '')}".strip() or None,
         "n_notes": len(record.notes()),
     } | {name: fix.get(name) for name in names}
+
+
+def _entries(value: Any) -> dict[str, Any]:  # noqa: ANN401  # whatever the record holds
+    """Return `value` if it has entries by name."""
+    return value if isinstance(value, dict) else {}
 
 
 def page(path: Path) -> dict[str, Any]:

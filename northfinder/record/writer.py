@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import sqlite3
 import threading
@@ -12,6 +11,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from northfinder.errors import RecordError
+from northfinder.record.files import log_of, make_folder, sync_folder
 from northfinder.record.lock import RecordLock
 from northfinder.record.schema import APPLICATION_ID, INSERT, PAGE_SIZE, SCHEMA, SCHEMA_VERSION, Row
 
@@ -32,14 +32,27 @@ Batch = tuple[str, list[Row]]
 
 def create(path: Path) -> tuple[sqlite3.Connection, RecordLock]:
     """Return a connection to a new, empty record, and the lock on it. Raises RecordError."""
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.open("xb").close()
     except FileExistsError:
         raise RecordError(f"the record {path} exists already, and records are never overwritten") from None
     except OSError as error:
         raise RecordError(f"the record {path} cannot be created: {error.strerror}") from None
-    return _open(path, "created", create_tables=True)
+    try:
+        return _open(path, "created", create_tables=True)
+    except RecordError:
+        for left in (path, log_of(path), path.with_name(f"{path.name}-shm")):  # it holds nothing
+            with suppress(OSError):
+                left.unlink(missing_ok=True)
+        raise
+
+
+def lay_out(db: sqlite3.Connection) -> None:
+    """Make an empty record of an empty database, in one transaction."""
+    db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+    db.executescript(f"BEGIN; {SCHEMA} COMMIT")
 
 
 def reopen(path: Path) -> tuple[sqlite3.Connection, RecordLock]:
@@ -52,21 +65,24 @@ def _open(path: Path, doing: str, *, create_tables: bool) -> tuple[sqlite3.Conne
     try:
         # Made here and used in the writer's thread alone from then on.
         db = sqlite3.connect(path, timeout=CLOSE_TIMEOUT, isolation_level=None, check_same_thread=False)
+    except sqlite3.Error as error:
+        lock.release()
+        raise RecordError(f"the record {path} cannot be {doing}: {error}") from error
+    try:
         if create_tables:
             db.execute(f"PRAGMA page_size = {PAGE_SIZE}")
         db.execute("PRAGMA synchronous = EXTRA")  # FULL, and no journal comes back after the power has failed
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA wal_autocheckpoint = 0")  # SQLite would keep its failures to itself
         if create_tables:
-            db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            db.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            db.executescript(f"BEGIN; {SCHEMA} COMMIT")
+            lay_out(db)
             db.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # from now on the file itself says what it is
     except sqlite3.Error as error:
+        db.close()
         lock.release()
         raise RecordError(f"the record {path} cannot be {doing}: {error}") from error
     if create_tables:
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     return db, lock
 
 
@@ -78,16 +94,6 @@ def finish(db: sqlite3.Connection) -> None:
     except sqlite3.OperationalError as error:
         if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
             raise
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new name in `folder` durable, where the system can."""
-    with suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 class Writer(threading.Thread):
