@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from recording import fill, make_record
+from recording import fill, make_record, span
 
 from northfinder.cli import main
 from northfinder.errors import RecordError
@@ -63,6 +63,40 @@ def test_records_lists_all_with_their_state(folder: Path, capsys: pytest.Capture
     assert code == 0
     assert "\x1b[2J" not in out
     assert "[red]" in out
+
+
+def test_a_list_of_records_is_a_line_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On 80 columns and narrower, and into a pipe: names as `find` gives them are whole, and come last."""
+    names = [f"north-20260101T120000.00000{k}Z.sqlite" for k in range(4)]
+    fix = {"azimuth_deg": 329.16, "azimuth_sd_deg": 0.2918, "latitude_deg": 50.0, "latitude_sd_deg": 0.2}
+    for k, name in enumerate(names[:3]):
+        with Recorder(tmp_path / name, lambda: 1.0) as recorder:
+            recorder.set_meta("plan", {"name": "drift-balanced", "steps": list(range(10))})
+            for step in range(k):
+                recorder.add_step(span(step, 0, 9))
+            if k:
+                recorder.add_event("state", "slew")
+            if k == 2:
+                recorder.add_fix(fix)
+    (tmp_path / names[3]).write_text("something else")
+    long = "a name that somebody gave to a record, longer than any terminal is wide, " * 3 + ".sqlite"
+    shutil.copy(tmp_path / names[2], tmp_path / long)
+    lock = RecordLock(tmp_path / names[0])
+    for columns in ("40", "80"):
+        monkeypatch.setenv("COLUMNS", columns)
+        code, out, _ = run(capsys, "records", str(tmp_path))
+        head, *lines, last = out.splitlines()
+        assert (code, head.split()[-1]) == (0, "record")
+        assert [line.split()[-1] for line in lines] == names[::-1]
+        assert max(map(len, lines)) <= 80
+        assert last.endswith(long)
+        assert lines[0].startswith("damaged ")
+        assert lines[1].split()[:5] == ["329.160", "±", "0.292", "drift-balanced", "0.1"]
+        assert lines[2].startswith("ends early, 1/10 ")
+        assert lines[3].startswith("being written, 0/10 ")
+    lock.release()
 
 
 def test_show_tells_all_but_the_samples(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
