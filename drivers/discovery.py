@@ -64,6 +64,16 @@ def open_stage(device: str, clock: Clock, **options: Any) -> Stage:  # noqa: ANN
     return stage
 
 
+def check_gyro(device: str, **options: Any) -> None:  # noqa: ANN401  # each driver has its own
+    """Raise ValueError where `open_gyro` would for the same reasons; nothing is opened."""
+    _found(GYROS, "gyro", device, options)
+
+
+def check_stage(device: str, **options: Any) -> None:  # noqa: ANN401  # each driver has its own
+    """Raise ValueError where `open_stage` would for the same reasons; nothing is opened."""
+    _found(STAGES, "stage", device, options)
+
+
 def recognisers() -> list[Recogniser]:
     """Return what every driver knows of its device's bytes, by the drivers' names."""
     return [entry.load() for entry in sorted(entry_points(group=RECOGNISERS), key=lambda entry: entry.name)]
@@ -150,6 +160,12 @@ def _nothing_known(port: str, heard: dict[int, int]) -> str:
 
 
 def _open(group: str, kind: str, device: str, clock: Clock, options: dict[str, Any]) -> Any:  # noqa: ANN401  # a driver's
+    factory, address = _found(group, kind, device, options)
+    return factory(address, clock, **options)
+
+
+def _found(group: str, kind: str, device: str, options: dict[str, Any]) -> tuple[Callable[..., Any], str]:
+    """Return the driver's function, which takes `options`, and what it is to open. Raises ValueError."""
     driver, colon, address = device.partition(":")
     known = {entry.name: entry for entry in entry_points(group=group)}
     if not (driver and colon and address):
@@ -161,7 +177,7 @@ def _open(group: str, kind: str, device: str, clock: Clock, options: dict[str, A
         )
     factory: Callable[..., Any] = known[driver].load()
     _check_options(driver, factory, options)
-    return factory(address, clock, **options)
+    return factory, address
 
 
 def _check_options(driver: str, factory: Callable[..., Any], options: dict[str, Any]) -> None:

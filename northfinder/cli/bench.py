@@ -10,7 +10,7 @@ from types import FrameType
 from typing import TypeVar
 
 from drivers.api import Clock, Gyro, Stage
-from drivers.discovery import open_gyro, open_stage
+from drivers.discovery import check_gyro, check_stage, open_gyro, open_stage
 from drivers.transport.clock import SystemClock
 from northfinder.cli import ending_signals
 from northfinder.config import Config, GyroTable, StageTable, read_config
@@ -24,13 +24,28 @@ def named_bench(gyro_address: str | None, stage_address: str | None, config_file
     if config_file is not None:
         if gyro_address or stage_address:
             raise ConfigError("--config names the devices: leave --gyro and --stage out")
-        return read_config(config_file)
+        return checked_bench(read_config(config_file))
     if gyro_address is None and stage_address is None:
         return None
     if gyro_address is None:
         raise ConfigError("--stage goes with --gyro, and that is missing")
     stage = None if stage_address is None else StageTable(address=stage_address)
-    return Config(gyro=GyroTable(address=gyro_address), stage=stage)
+    return checked_bench(Config(gyro=GyroTable(address=gyro_address), stage=stage))
+
+
+def checked_bench(config: Config) -> Config:
+    """Return the bench if there are drivers for it that take what they are told; nothing is opened. Raises ConfigError.
+
+    So a name mistyped is found before a record is begun.
+    """
+    gyro, stage = config.gyro, config.stage
+    try:
+        check_gyro(gyro.address, **gyro.driver_options())
+        if stage is not None:
+            check_stage(stage.address, limits=stage.limits(), **stage.driver_options())
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    return config
 
 
 def gyro_of(table: GyroTable, clock: Clock) -> Gyro:

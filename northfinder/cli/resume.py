@@ -13,7 +13,7 @@ import msgspec
 
 from drivers.transport.clock import SystemClock
 from northfinder.cli.aside import Aside
-from northfinder.cli.bench import stop_on_signal
+from northfinder.cli.bench import checked_bench, stop_on_signal
 from northfinder.cli.display import DisplayContext
 from northfinder.cli.find import planned_gyro, stage_opener
 from northfinder.cli.options import FILE
@@ -83,10 +83,10 @@ def command(
 
 
 def _bench(config: Config, gyro_address: str | None, stage_address: str | None) -> Config:
-    """Return the bench with the devices where they are now."""
+    """Return the bench with the devices where they are now. Raises ConfigError."""
     if gyro_address is not None:
         config = msgspec.structs.replace(config, gyro=msgspec.structs.replace(config.gyro, address=gyro_address))
     if stage_address is not None:
         stage = config.stage or StageTable(address=stage_address)
         config = msgspec.structs.replace(config, stage=msgspec.structs.replace(stage, address=stage_address))
-    return config
+    return checked_bench(config)
