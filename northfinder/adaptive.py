@@ -12,11 +12,20 @@ from northfinder.cyclogram import BUILT_IN, Cyclogram, Standing, Step, find_cycl
 from northfinder.errors import ConfigError, SequenceError
 from northfinder.estimation.planning import Prediction, Truth
 from northfinder.layouts import MEASURE_LATITUDE, PLANS
-from northfinder.plans import Conditions, candidates, filled, following_turns, time_of_turns
+from northfinder.plans import (
+    Conditions,
+    candidates,
+    filled,
+    following_turns,
+    require_time,
+    shortest_filled,
+    time_of_turns,
+    too_short,
+)
 from northfinder.reduction import MEAN_INTERVAL
 from northfinder.solution import Assumptions
 from northfinder.triad_plans import TRIAD_PLANS
-from northfinder.turns import Turns
+from northfinder.turns import BLOCK_PAUSE, Turns
 
 #: Time of a plan that fills whatever it is given, s.
 DEFAULT_TIME = 300.0
@@ -119,8 +128,13 @@ def _whole_means(dwell: float, *, last: bool) -> float:
     return MEAN_INTERVAL * max(1, math.floor(n + 1e-6) if last else round(n))
 
 
-def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> AdaptivePlan:
-    """Return the plan that the operator wishes for; raises ConfigError if the wishes do not go together.
+def make_plan(
+    wishes: Wishes, assumptions: Assumptions, *, settle: float, quickest: Turns | None = None
+) -> AdaptivePlan:
+    """Return the plan that the operator wishes for.
+
+    Raises ConfigError if the wishes do not go together, or their time is too short for the `quickest` turns that the
+    stage may turn out to make; by default those of one that turns at once.
 
     Without a name it is `refined`, or the published six positions if there is no noise model to plan by or a dwell is
     given. Those and four positions keep their dwells unless a time is given; all other built-in plans fill a time.
@@ -144,8 +158,12 @@ def make_plan(wishes: Wishes, assumptions: Assumptions, *, settle: float) -> Ada
             else _fixed(name, time, wishes, turns)
         )
 
-    if not searched and name not in TRIAD_PLANS:
-        find_cyclogram(name)  # complains now, rather than once the devices are open
+    # Complains now, rather than once the devices are open, of what no stage could do.
+    quickest = quickest or Turns(pause=settle + BLOCK_PAUSE)
+    if searched and time:
+        require_time(name, _conditions(name, time, wishes, assumptions, quickest))
+    else:
+        _fixed(name, time, wishes, quickest)
     return AdaptivePlan(
         name=name,
         design=design,
@@ -186,17 +204,24 @@ def _check_wishes(name: str, wishes: Wishes, *, searchable: bool) -> None:
 
 def _fixed(name: str, time: float | None, wishes: Wishes, turns: Turns) -> Design:
     """Return a cyclogram as it stands, or stretched to the time."""
-    dwell = wishes.dwell or _DEFAULT_DWELL
-    cyclogram: Cyclogram | None = TRIAD_PLANS[name](dwell) if name in TRIAD_PLANS else find_cyclogram(name, dwell=dwell)
-    if time is not None and cyclogram is not None:
-        cyclogram = filled(cyclogram, turns, time, azimuth=wishes.azimuth or 0.0)
-    if cyclogram is None:
-        raise ConfigError(f"the plan {name} does not fit into {time:g} s: its dwells would be too short")
-    return Design(cyclogram=cyclogram, turns=turns)
+    dwell, azimuth = wishes.dwell or _DEFAULT_DWELL, wishes.azimuth or 0.0
+    cyclogram = TRIAD_PLANS[name](dwell) if name in TRIAD_PLANS else find_cyclogram(name, dwell=dwell)
+    if time is None:
+        return Design(cyclogram=cyclogram, turns=turns)
+    stretched = filled(cyclogram, turns, time, azimuth=azimuth)
+    if stretched is None:
+        raise too_short(name, time, shortest_filled(cyclogram, turns, azimuth=azimuth), turns)
+    return Design(cyclogram=stretched, turns=turns)
 
 
 def _searched(name: str, time: float, wishes: Wishes, assumptions: Assumptions, turns: Turns) -> Design:
     """Return the best plan of that name for the time."""
+    (found,) = candidates(name, _conditions(name, time, wishes, assumptions, turns))
+    return Design(cyclogram=found.cyclogram, turns=turns, prediction=found.prediction)
+
+
+def _conditions(name: str, time: float, wishes: Wishes, assumptions: Assumptions, turns: Turns) -> Conditions:
+    """Return what a plan is searched for."""
     noise, known = assumptions.noise(), assumptions.known()
     if noise is None:
         raise SequenceError(f"the plan {name} was to be searched without a noise model")
@@ -205,7 +230,7 @@ def _searched(name: str, time: float, wishes: Wishes, assumptions: Assumptions, 
         azimuth=truth.azimuth if wishes.azimuth is None else wishes.azimuth,
         latitude=truth.latitude if known.latitude is None else known.latitude,
     )
-    conditions = Conditions(
+    return Conditions(
         noise=noise,
         known=known,
         turns=turns,
@@ -213,5 +238,3 @@ def _searched(name: str, time: float, wishes: Wishes, assumptions: Assumptions, 
         needs_latitude=known.latitude is None and name in MEASURE_LATITUDE,
         truth=truth,
     )
-    (found,) = candidates(name, conditions)
-    return Design(cyclogram=found.cyclogram, turns=turns, prediction=found.prediction)

@@ -22,8 +22,12 @@ OPENING_DWELLS = (5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 70.0, 100.0, 150.0, 240.0, 4
 OPENING_SD = math.radians(1.0)
 #: The same where the gyro allows no better: pairs that stand so far off see 4 % less.
 COARSEST_OPENING_SD = math.radians(15.0)
+#: The longest time that a plan is ever given, s.
+LONGEST_TIME = 3600.0
 #: How much more an error of the azimuth counts than one of the latitude, where both are wanted.
 AZIMUTH_WEIGHT = 2.0
+#: Repetitions or dwells of which one is enough to tell whether a plan fits a time at all.
+_FEW = (1, 2, 3, 4, 6, 8)
 #: A search predicts from about this many means at most, of whole seconds; what it finds is predicted from means of 1 s.
 N_MEANS = 480
 
@@ -88,11 +92,50 @@ def candidates(name: str, conditions: Conditions, *, n: int = 1) -> list[Candida
         for each in _search(family, conditions)
     ]
     if not found:
-        raise ConfigError(
-            f"the plan {name} does not fit into {conditions.time:g} s, or determines no azimuth in that time"
-        )
+        raise too_short(name, conditions.time, shortest_time(name, conditions), conditions.turns)
     shortlist = sorted(found, key=lambda each: each.score)[:n]
     return sorted((_predicted_exactly(each, conditions) for each in shortlist), key=lambda each: each.score)
+
+
+def require_time(name: str, conditions: Conditions) -> None:
+    """Raise ConfigError if no plan of that name fits the time of the conditions and determines an azimuth in it."""
+    if not _fits(name, conditions):
+        raise too_short(name, conditions.time, shortest_time(name, conditions), conditions.turns)
+
+
+def too_short(name: str, time: float, shortest: float | None, turns: Turns) -> ConfigError:
+    """Return what to say of a time that a plan does not fit into, and of the `shortest` that it would; both in s."""
+    if shortest is None:
+        return ConfigError(
+            f"the plan {name} determines no azimuth in {time:g} s, nor in any time up to {LONGEST_TIME:g} s, with this "
+            "gyro on this stage"
+        )
+    presumed = "" if math.isfinite(turns.acceleration) else ", more on a slow stage"
+    return ConfigError(f"the plan {name} does not fit into {time:g} s: it takes at least {shortest:g} s{presumed}")
+
+
+def shortest_time(name: str, conditions: Conditions) -> float | None:
+    """Return the shortest time in whole s, longer than that of the conditions, that a plan of that name needs.
+
+    None if not even LONGEST_TIME is enough for the noise and the stage.
+    """
+    too_little, enough = math.floor(conditions.time), math.floor(LONGEST_TIME)
+    if not _fits(name, replace(conditions, time=enough)):
+        return None
+    while enough - too_little > 1:
+        middle = (too_little + enough) // 2
+        if _fits(name, replace(conditions, time=middle)):
+            enough = middle
+        else:
+            too_little = middle
+    return enough
+
+
+def _fits(name: str, conditions: Conditions) -> bool:
+    """Return whether any plan of that name fits the time and determines an azimuth in it; fewest dwells first."""
+    counts = [n for n in _FEW if n <= max(1.0, conditions.time / SHORTEST_DWELL)]
+    layouts = ((family, n) for family in families(name, needs_latitude=conditions.needs_latitude) for n in counts)
+    return any(_candidate(family, n, conditions) is not None for family, n in layouts)
 
 
 def _search(family: Family, conditions: Conditions) -> list[Candidate]:
@@ -176,6 +219,13 @@ def filled(cyclogram: Cyclogram, turns: Turns, time: float, *, azimuth: float, n
     if factor * min(step.dwell for step in free) < SHORTEST_DWELL:
         return None
     return replace(cyclogram, steps=fixed + tuple(replace(step, dwell=factor * step.dwell) for step in free))
+
+
+def shortest_filled(cyclogram: Cyclogram, turns: Turns, *, azimuth: float) -> float:
+    """Return the shortest time in whole s for which `filled` gives a cyclogram."""
+    turning = time_of_turns(tuple(following_turns(cyclogram, Standing(), azimuth)), turns, 0.0, 0.0)
+    dwells = [step.dwell for step in cyclogram.steps]
+    return math.ceil(turning + SHORTEST_DWELL * sum(dwells) / min(dwells))
 
 
 @lru_cache(maxsize=16)

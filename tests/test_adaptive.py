@@ -17,6 +17,7 @@ from northfinder.measurement import Measurement, Outcome, measure
 from northfinder.record import DwellSpan, Record
 from northfinder.sequencer import Progress
 from northfinder.solution import Assumptions, solve
+from northfinder.turns import Turns
 
 LATITUDE_DEG = 50.429
 LIMITS = StageLimits(
@@ -219,14 +220,41 @@ def test_wishes_that_do_not_go_together(wishes: Wishes, profile: str | None, mes
 
 def test_a_time_or_a_stage_that_does_not_do_is_refused() -> None:
     """Too short a time, and a stage that cannot turn to any azimuth, are named once the stage is known."""
-    with pytest.raises(ConfigError, match="refined does not fit into 40 s"):
-        designed(Wishes(time=40.0))
+    with pytest.raises(ConfigError, match=r"refined does not fit into 80 s: it takes at least 115 s$"):
+        make_plan(Wishes(time=80.0), assume(), settle=0.5).check(LIMITS)
     short = make_plan(Wishes(time=60.0), assume(profile=None), settle=0.5)
-    with pytest.raises(ConfigError, match="six-position does not fit into 60 s"):
+    with pytest.raises(ConfigError, match=r"six-position does not fit into 60 s: it takes at least 126 s$"):
         short.check(LIMITS)
     narrow = replace(LIMITS, azimuth_min=0.0, azimuth_max=math.radians(300))
     with pytest.raises(ConfigError, match="refined may need any azimuth: the stage turns only from 0 to 300 deg"):
         make_plan(Wishes(), assume(), settle=0.5).check(narrow)
+
+
+@pytest.mark.parametrize(
+    ("name", "profile"),
+    [("refined", "tvg43"), ("six-position", "tvg43"), ("drift-balanced", "tvg43"), ("four-position", None)],
+)
+def test_the_time_named_is_the_shortest_that_does(name: str, profile: str | None) -> None:
+    """Given that time the plan is made, given a second less it is not, with a noise model and without."""
+    assumptions = assume(profile)
+    quickest = Turns.of_stage(LIMITS, 0.5)
+    with pytest.raises(ConfigError, match="takes at least") as refused:
+        make_plan(Wishes(name=name, time=25.0), assumptions, settle=0.5, quickest=quickest)
+    assert str(refused.value).endswith(" s")
+    shortest = float(str(refused.value).split()[-2])
+    make_plan(Wishes(name=name, time=shortest), assumptions, settle=0.5, quickest=quickest).check(LIMITS)
+    with pytest.raises(ConfigError, match="does not fit into"):
+        make_plan(Wishes(name=name, time=shortest - 1.0), assumptions, settle=0.5, quickest=quickest)
+
+
+def test_a_time_that_no_stage_could_keep_is_refused_at_once(tmp_path: Path) -> None:
+    """Before the stage is known; and noise that no time makes up for is called that."""
+    with pytest.raises(ConfigError, match="at least 52 s, more on a slow stage"):
+        make_plan(Wishes(time=40.0), assume(), settle=0.5)
+    noisy = tmp_path / "noisy.toml"
+    noisy.write_text('name = "noisy"\n[noise]\nangle_random_walk_deg_per_sqrt_h = 1e4\n')
+    with pytest.raises(ConfigError, match="determines no azimuth in 300 s, nor in any time up to 3600 s"):
+        make_plan(Wishes(time=300.0), assume(str(noisy)), settle=0.5)
 
 
 def test_true_azimuths_from_a_file(tmp_path: Path) -> None:

@@ -1,12 +1,13 @@
 """What `find` asks of the plan: the command line before the configuration."""
 
 import math
+from pathlib import Path
 
 import click
 import pytest
 
 from northfinder.adaptive import Wishes
-from northfinder.cli import cli
+from northfinder.cli import cli, main
 from northfinder.cli.find import Options, command
 from northfinder.config import MeasurementTable
 from northfinder.errors import ConfigError
@@ -50,6 +51,39 @@ def test_what_is_of_the_emulator_is_refused_beside_devices(option: list[str]) ->
         Options(**context.params).bench()
     with command.make_context("find", devices) as context:
         assert Options(**context.params).bench() is not None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("--time 100", "refined does not fit into 100 s: it takes at least 115 s"),
+        ("--time 125 --plan six-position", "six-position does not fit into 125 s: it takes at least 126 s"),
+        (
+            "--gyro native:/dev/null --stage native:/dev/null --profile tvg43 --time 40",
+            "takes at least 52 s, more on a slow stage",
+        ),
+        ("--config slow.toml", "takes at least 81 s, more on a slow stage"),
+        ("--gyro nativ:/dev/null --stage native:/dev/null", "no gyro driver 'nativ' in 'nativ:/dev/null'"),
+        ("--gyro native:/dev/null --stage native", "'native' names no stage"),
+        ("--config mistyped.toml", "no stage driver 'zabr'"),
+        ("--config option.toml", "the driver 'native' takes no option 'colour'"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_a_record_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: str, sentence: str
+) -> None:
+    """A time too short for any such stage, with the shortest that does, or a driver that there is not: exit code 2."""
+    monkeypatch.chdir(tmp_path)
+    bench = '[gyro]\naddress = "native:/dev/null"\nprofile = "tvg43"\n[stage]\naddress = "{}:/dev/null"\n'
+    Path("mistyped.toml").write_text(bench.format("zabr"))
+    Path("slow.toml").write_text(bench.format("native") + "max_speed_deg_s = 20.0\n[measurement]\ntime_s = 60.0\n")
+    Path("option.toml").write_text(bench.format("native") + '[stage.options]\ncolour = "red"\n')
+    with pytest.raises(SystemExit) as left:
+        main(["find", *arguments.split(), "--out", "records"])
+    err = capsys.readouterr().err
+    assert (left.value.code, len(err.splitlines())) == (2, 1)
+    assert sentence in err
+    assert not Path("records").exists()
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ from northfinder.layouts import PLANS
 from northfinder.measurement import Measurement, measure
 from northfinder.solution import Assumptions, Method
 from northfinder.triad_plans import TRIAD_PLANS, fit_for
+from northfinder.turns import BLOCK_PAUSE, Turns
 
 #: When the command was given, as near as can be told.
 STARTED = time.monotonic()
@@ -104,7 +105,8 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
     assumptions = options.assumptions(config)
     place = options.place(config.measurement)
     wishes = options.wishes(config.measurement)
-    plan = make_plan(wishes, assumptions, settle=config.measurement.settle_s)
+    settle = config.measurement.settle_s
+    plan = make_plan(wishes, assumptions, settle=settle, quickest=_quickest_turns(config.stage, truth, settle))
     _check_stage(config, plan.name)
     clock = SystemClock()
     with ExitStack() as stack:
@@ -306,6 +308,23 @@ def _check_stage(config: Config, plan: str) -> None:
             f"the plan {plan} turns the gyro on a stage: give --stage, or [stage] in the bench's file; "
             f"without one a triad has the plans {' and '.join(TRIAD_PLANS)}"
         )
+
+
+def _quickest_turns(stage: StageTable | None, truth: SimulationOptions | None, settle: float) -> Turns:
+    """Return the turns of the stage as far as they are known before it is asked: it will be no quicker."""
+    if truth is None:
+        return Turns(pause=settle + BLOCK_PAUSE) if stage is None else Turns.of_stage(stage.limits(), settle)
+    from sim_device.plant.profile import load_profile  # noqa: PLC0415  # not needed with devices
+
+    try:
+        emulated = load_profile(truth.profile).stage
+    except ValueError as error:
+        raise ConfigError(f"--sim-profile: {error}") from None
+    return Turns(
+        speed=math.radians(emulated.max_speed_deg_per_s),
+        acceleration=math.radians(emulated.max_acceleration_deg_per_s2),
+        pause=settle + BLOCK_PAUSE,
+    )
 
 
 def planned_gyro(table: GyroTable, clock: Clock, calibration: Calibration | None, plan: str) -> Gyro:
