@@ -201,7 +201,7 @@ def test_a_record_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_a_missing_record_is_named(tmp_path: Path) -> None:
     """A path to nothing gives one sentence."""
-    with pytest.raises(RecordError, match=r"none.sqlite cannot be read: No such file"):
+    with pytest.raises(RecordError, match=r"none.sqlite: cannot be read: No such file"):
         Record(tmp_path / "none.sqlite")
 
 

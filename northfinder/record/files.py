@@ -18,10 +18,10 @@ def require_file(path: Path) -> None:
         mode = path.stat().st_mode
     except OSError as error:
         left = "; its log is there: northfinder recover saves what that holds" if has_log(path) else ""
-        raise RecordError(f"{path} cannot be read: {error.strerror}{left}") from None
+        raise RecordError(f"{path}: cannot be read: {error.strerror}{left}") from None
     if not stat.S_ISREG(mode):
         found = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
-        raise RecordError(f"{path} cannot be read: found {found}, expected a file")
+        raise RecordError(f"{path}: cannot be read: found {found}, expected a file")
 
 
 def log_of(path: Path) -> Path:

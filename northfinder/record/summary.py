@@ -21,7 +21,7 @@ def list_records(folder: Path) -> list[dict[str, Any]]:
     try:
         found = sorted((path for path in folder.iterdir() if path.suffix == ".sqlite"), reverse=True)
     except OSError as error:
-        raise RecordError(f"{folder} cannot be read: {error.strerror}, expected a folder with records") from None
+        raise RecordError(f"{folder}: cannot be read: {error.strerror}, expected a folder with records") from None
     return [summary(path) for path in found[:MAX_LISTED]]
 
 
