@@ -11,6 +11,7 @@ from drivers.api import Clock, Gyro, RateBlock, Stage
 from northfinder.errors import EstimateError
 from northfinder.estimation import Fix
 from northfinder.record import DwellSpan, Record
+from northfinder.record.facts import require_unfinished
 from northfinder.record.recorder import Recorder
 from northfinder.reduction import Reduction, reduce_record
 from northfinder.sequencer import Plan, Progress, Sequencer
@@ -77,8 +78,8 @@ def measure(
     Raises what `Sequencer.run` raises, RecordError, and EstimateError if the data determine no azimuth. The record is
     closed in every case.
     """
-    earlier, reduction = _before(measurement)
     with Recorder(measurement.record, utc, clock=clock.now, resume=measurement.resume) as recorder:
+        earlier, reduction = _before(measurement)  # now that nobody else goes on with it
         for key, value in measurement.meta.items():
             recorder.set_meta(key, value)
         recorder.set_meta("assumptions", measurement.assumptions)
@@ -111,10 +112,14 @@ def measure(
 
 
 def _before(measurement: Measurement) -> tuple[Earlier, Reduction]:
-    """Return what the record of a measurement to be resumed holds, and its means; nothing for a new one."""
+    """Return what the record of a measurement to be resumed holds, and its means; nothing for a new one.
+
+    Raises RecordError if nothing is left to resume.
+    """
     if not measurement.resume:
         return Earlier(), Reduction()
     with Record(measurement.record) as record:
+        require_unfinished(record)
         return earlier_of(record), reduce_record(record)
 
 

@@ -13,6 +13,7 @@ from northfinder.config import Config
 from northfinder.cyclogram import Cyclogram
 from northfinder.errors import RecordError
 from northfinder.record import Record
+from northfinder.record.facts import require_unfinished
 from northfinder.solution import Assumptions
 from northfinder.solve_file import kept_assumptions
 
@@ -42,8 +43,7 @@ def remainder_of(record: Record) -> Remainder:
 
     Raises RecordError if the measurement is complete, or the record does not hold what it takes.
     """
-    if record.is_complete():
-        raise RecordError(f"the record {record.path} holds a whole measurement: nothing is left to resume")
+    require_unfinished(record)
     config = _kept(record, "config", Config)
     assumptions = kept_assumptions(record)
     settle = config.measurement.settle_s

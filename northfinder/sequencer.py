@@ -256,9 +256,10 @@ class Sequencer:
     def _identify(self) -> Event:
         gyro, stage = self._devices()
         self.identities = {"gyro": gyro.connect(), "stage": stage.connect()}
+        # First, so that a record says nothing of devices that none of its samples are from.
+        self.earlier.check(self.identities, sample_rate=gyro.sample_rate, n_axes=gyro.n_axes)
         self.recorder.set_meta("identities", self.identities)
         self.recorder.set_meta("sample_rate", gyro.sample_rate)
-        self.earlier.check(self.identities["gyro"], sample_rate=gyro.sample_rate, n_axes=gyro.n_axes)
         self.plan.check(stage.limits)
         self.recorder.set_meta("plan", self.plan.outline())
         n_done = len(self.spans)

@@ -8,6 +8,7 @@ time between two streams only says how far slow noise may have moved meanwhile.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -39,11 +40,11 @@ class Earlier:
     last: RateBlock | None = None  #: the last block of that stream
     elapsed: float = field(default=0.0)  #: s of the plan that the finished dwells and their slews have taken
 
-    def check(self, gyro: DeviceIdentity, *, sample_rate: float, n_axes: int) -> None:
-        """Raise ConfigError unless the rest is to be measured with the same gyro in the same way."""
+    def check(self, identities: Mapping[str, DeviceIdentity], *, sample_rate: float, n_axes: int) -> None:
+        """Raise ConfigError unless the rest is to be measured with the same gyro in the same way, on the same stage."""
         if self.anchor is None:
             return
-        before = self._gyro()
+        gyro, before = identities["gyro"], self._said_of("gyro")
         found = (gyro.model, gyro.serial_number, sample_rate, n_axes)
         expected = (before.get("model"), before.get("serial_number"), self.anchor.sample_rate, self.anchor.n_axes)
         if found != expected:
@@ -51,6 +52,18 @@ class Earlier:
             raise ConfigError(
                 f"the rest must be measured with the same gyro: found {shown.format(*found)}, "
                 f"expected {printable(shown.format(*expected))}"
+            )
+        self._check_stage(identities["stage"])
+
+    def _check_stage(self, stage: DeviceIdentity) -> None:
+        """Raise ConfigError for another stage: its azimuth zero points elsewhere."""
+        before = self._said_of("stage")
+        found = (stage.model, stage.serial_number)
+        expected = (before.get("model"), before.get("serial_number"))
+        if before and found != expected:
+            raise ConfigError(
+                f"the rest must be measured on the same stage: found {printable('{} {}'.format(*found))}, "
+                f"expected {printable('{} {}'.format(*expected))}"
             )
 
     def place(self, block: RateBlock, gyro: DeviceIdentity, *, sample_rate: float, utc: float) -> StreamPlace:
@@ -66,14 +79,15 @@ class Earlier:
         start = last_start + pause - block.first_index / sample_rate
         return StreamPlace(start=start, turn_on=span.turn_on if went_on else span.turn_on + 1)
 
-    def _gyro(self) -> dict[str, Any]:
-        found = self.anchor.identities.get("gyro") if self.anchor else None
+    def _said_of(self, device: str) -> dict[str, Any]:
+        identities = self.anchor.identities if self.anchor else None
+        found = identities.get(device) if isinstance(identities, dict) else None
         return found if isinstance(found, dict) else {}
 
     def _same_turn_on(self, gyro: DeviceIdentity, disagreement: float) -> bool:
         if not gyro.boot_count:  # it may not count them
-            return disagreement < _CLOCKS_AGREE and not self._gyro().get("boot_count")
-        return gyro.boot_count == self._gyro().get("boot_count")
+            return disagreement < _CLOCKS_AGREE and not self._said_of("gyro").get("boot_count")
+        return gyro.boot_count == self._said_of("gyro").get("boot_count")
 
 
 def earlier_of(record: Record) -> Earlier:

@@ -304,6 +304,42 @@ def test_what_shall_be_written_goes_nowhere_else(tmp_path: Path) -> None:
     assert {each.name for each in tmp_path.iterdir()} == {"r.sqlite", "out.csv.part", "link.csv", "out.csv"}
 
 
+#: Lets files have so many bytes at the most, which is what a full disk looks like.
+NO_ROOM = "import resource, sys; n = int(sys.argv[1]); resource.setrlimit(resource.RLIMIT_FSIZE, (n, n)); "
+COMMAND = "from northfinder.cli import main; main(sys.argv[2:])"
+BEGINNING = (
+    "from pathlib import Path; from northfinder.record.recorder import Recorder; Recorder(Path(sys.argv[2]), float)"
+)
+
+
+def without_room(room: int, program: str, *given: str) -> subprocess.CompletedProcess[str]:
+    """Run a program whose files may have `room` bytes."""
+    return subprocess.run(
+        [sys.executable, "-c", NO_ROOM + program, str(room), *given],
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("room", [1, 10_000, 60_000])
+@pytest.mark.parametrize(
+    "given", [["recover"], *(["export", "--to", kind] for kind in ("csv", "parquet", "npz", "mat"))]
+)
+def test_a_disk_without_room_is_left_as_it_was(tmp_path: Path, given: list[str], room: int) -> None:
+    """One sentence, exit code 5, and nothing but the record."""
+    path = make_record(tmp_path / "r.sqlite", 400)
+    ended = without_room(room, COMMAND, *given, str(path))
+    assert (ended.returncode, ended.stdout, len(ended.stderr.splitlines())) == (5, "", 1), ended.stderr
+    assert [each.name for each in tmp_path.iterdir()] == ["r.sqlite"]
+
+
+@pytest.mark.parametrize("room", [1, 10_000, 60_000])
+def test_a_record_that_cannot_be_begun_is_no_file(tmp_path: Path, room: int) -> None:
+    """An empty file would be listed as a damaged record."""
+    ended = without_room(room, BEGINNING, str(tmp_path / "r.sqlite"))
+    assert "cannot be created" in ended.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture(scope="module")
 def long_record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a record that takes seconds to export or to recover."""

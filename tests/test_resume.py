@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 from virtual import VirtualBench, assume, virtual_bench
 
-from drivers.api import Gyro, RateBlock, Stage
+from drivers.api import DeviceIdentity, Gyro, RateBlock, Stage
 from drivers.native import NativeGyro, NativeStage
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.config import Config, GyroTable, StageTable
 from northfinder.errors import ConfigError, RecordError
 from northfinder.estimation import Fix
 from northfinder.measurement import Measurement, Outcome, measure
-from northfinder.record import DwellSpan, Record
+from northfinder.record import DwellSpan, Record, StreamInfo
 from northfinder.record.check import examine
 from northfinder.reduction import Reduction
 from northfinder.resume import remainder_of
 from northfinder.sequencer import Progress, State
 from northfinder.solution import solve
 from northfinder.solve_file import solve_record
+from northfinder.streams import Earlier
 
 WISHES = Wishes(name="refined", time=100.0)
 ASSUMPTIONS = assume(latitude_deg=50.429)
@@ -195,15 +196,42 @@ def test_another_gyro_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"same gyro: found tvg43 SIM-G16.* expected tvg43 SIM-G15"):
         resumed(virtual_bench(seed=16), path)
     assert len(spans_of(path)) == 2
+    with Record(path) as record:
+        assert record.meta("identities")["gyro"]["serial_number"] == "SIM-G15"
+
+
+def test_another_stage_is_refused() -> None:
+    """Its azimuth zero points elsewhere; what a record does not say of a stage is no reason to refuse one."""
+    gyro, stage = (DeviceIdentity(kind=kind, model="m", serial_number="1") for kind in ("gyro", "stage"))
+    other = replace(stage, serial_number="2")
+    kept = {kind: {"model": "m", "serial_number": "1"} for kind in ("gyro", "stage")}
+    anchor = StreamInfo(stream=0, utc=0.0, clock=0.0, sample_rate=9.0, n_axes=1, identities=kept, software="")
+    Earlier(anchor=anchor).check({"gyro": gyro, "stage": stage}, sample_rate=9.0, n_axes=1)
+    with pytest.raises(ConfigError, match="same stage: found m 2, expected m 1"):
+        Earlier(anchor=anchor).check({"gyro": gyro, "stage": other}, sample_rate=9.0, n_axes=1)
+    unsaid = replace(anchor, identities={"gyro": kept["gyro"]})
+    Earlier(anchor=unsaid).check({"gyro": gyro, "stage": other}, sample_rate=9.0, n_axes=1)
 
 
 def test_a_whole_measurement_is_not_resumed(tmp_path: Path) -> None:
     """Nor is a record that does not say how to go on."""
     bench = virtual_bench(seed=17)
     path = interrupted(bench, tmp_path / "r.sqlite", lambda now: (now.state, now.n_done) == (State.SLEW, 4))
+    with Record(path) as record:
+        too_late = remainder_of(record)
     resumed(bench, path)
     with Record(path) as record, pytest.raises(RecordError, match="whole measurement"):
         remainder_of(record)
+    # Somebody else has gone on with it between a look at the record and its lock.
+    measurement = Measurement(
+        open_gyro=bench.open_gyro, open_stage=bench.open_stage, plan=too_late.plan, settle=0.5,
+        assumptions=too_late.assumptions, record=path, resume=True,
+    )  # fmt: skip
+    with pytest.raises(RecordError, match="whole measurement"):
+        measure(measurement, clock=bench.clock, utc=bench.clock.now, watcher=Cutter(path, never))
+    with Record(path) as record:
+        assert len(record.fixes()) == 1
+    assert examine(path).sound
 
 
 # The estimate from two streams against that from one, of the same samples.

@@ -63,6 +63,12 @@ def require_complete(record: Record) -> None:
         )
 
 
+def require_unfinished(record: Record) -> None:
+    """Raise RecordError if the measurement went on to its fix: there is nothing to go on with."""
+    if record.is_complete():
+        raise RecordError(f"the record {record.path} holds a whole measurement: nothing is left to resume")
+
+
 def completeness(record: Record) -> dict[str, Any]:
     """Return whether the record holds a whole measurement, and how much of it in words."""
     return {"complete": record.is_complete(), "steps": _steps_done(record)}

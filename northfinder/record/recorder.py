@@ -52,14 +52,23 @@ class Recorder:
         self.stream = 0  #: number of the gyro's stream that is being recorded
         self.resumed = resume  #: whether it goes on with what was interrupted
         self._next_row = dict.fromkeys(TABLES, 1)
-        if resume:
-            with Record(path) as record:
-                self.n_samples, self.n_lost = record.totals()
-                self._next_row = {table: record.count(table) + 1 for table in TABLES}
-                self.stream = max((info.stream for info in record.streams()), default=-1) + 1
         opened = writer.reopen(path) if resume else writer.create(path)
         self._writer = writer.Writer(path, opened)
         self._writer.start()
+        if resume:
+            self._go_on()
+
+    def _go_on(self) -> None:
+        """Count on from what the record holds, now that nobody else writes it. Raises RecordError."""
+        try:
+            with Record(self.path) as record:
+                self.n_samples, self.n_lost = record.totals()
+                self._next_row = {table: record.count(table) + 1 for table in TABLES}
+                self.stream = max((info.stream for info in record.streams()), default=-1) + 1
+        except RecordError:
+            self._closed = True
+            self._writer.close()
+            raise
 
     def __enter__(self) -> Self:
         """Return the recorder itself."""
