@@ -73,7 +73,8 @@ def test_names_and_kinds_of_files_that_cannot_be(
 ) -> None:
     """A name that is too long, a folder, a link to itself, a file as folder."""
     assert "File name too long" in refused(capsys, command, tmp_path / ("a" * 300))
-    assert "found a folder, expected a file" in refused(capsys, command, tmp_path)
+    for folder in (tmp_path, Path("/"), Path()):
+        assert "found a folder, expected a file" in refused(capsys, command, folder)
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert "symbolic links" in refused(capsys, command, tmp_path / "loop")
     (tmp_path / "file").touch()
@@ -277,6 +278,16 @@ def test_notes_that_say_nothing_or_too_much(
     assert code == 2
     assert f"found {found}, expected 1 to 4000 characters" in err
     assert path.read_bytes() == before
+
+
+def test_a_note_that_is_the_name_of_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Somebody has forgotten the note: it does not go into the newest record instead."""
+    path = make_record(tmp_path / "r.sqlite", 3)
+    code, _, err = run(capsys, "note", str(path), "--in", str(tmp_path))
+    assert code == 2
+    assert "found the name of a file" in err
+    with Record(path) as record:
+        assert record.notes() == []
 
 
 def test_a_note_of_several_lines_becomes_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

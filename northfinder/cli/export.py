@@ -29,7 +29,7 @@ def command(*, file: Path, kind: str, out: Path | None, as_json: bool) -> None:
       northfinder export records/north-20260101T120000.000000Z.sqlite --to parquet
       northfinder export records/north-20260101T120000.000000Z.sqlite --to csv -o samples.csv
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
-    out = out or file.with_suffix(f".{kind}")
+    out = out or file.parent / f"{file.stem}.{kind}"
     with tidied_up(), Record(file) as record:
         n_samples = export_record(record, out, kind)
     if as_json:

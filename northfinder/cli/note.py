@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -32,6 +33,10 @@ def command(*, text: str, record: Path | None, folder: Path, as_json: bool) -> N
     if not any(map(str.isprintable, line)) or len(line) > MAX_NOTE:
         found = f"{len(line)} characters" if line else "nothing to read"
         raise click.BadParameter(f"found {found}, expected 1 to {MAX_NOTE} characters", param_hint="TEXT")
+    if record is None and os.path.isfile(text):  # noqa: PTH113  # Path.is_file raises where a name is too long
+        raise click.BadParameter(
+            f"found the name of a file, {text!r}, expected what there is to note", param_hint="TEXT"
+        )
     path = record or newest_record(folder)
     add_note(path, line, now=time.time())
     if as_json:

@@ -27,7 +27,7 @@ def command(*, record: Path, out: Path | None, as_json: bool) -> None:
       northfinder recover records/north-20260101T120000.000000Z.sqlite
       northfinder recover records/north-20260101T120000.000000Z.sqlite --out saved.sqlite --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
-    out = out or record.with_name(f"{record.stem}-recovered{record.suffix}")
+    out = out or record.parent / f"{record.stem}-recovered{record.suffix}"
     with tidied_up():
         salvage = recover(record, out)
     if as_json:

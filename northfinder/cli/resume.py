@@ -44,11 +44,12 @@ def command(
 ) -> None:
     """Go on with the measurement of RECORD at the step in hand, with the same plan and the same devices.
 
-    After a power cut, a program that was killed, or a cable pulled out. The same gyro must be there; if it was
-    switched off meanwhile it gets a bias of its own for the rest.
+    After a power cut, a program that was killed, or a cable pulled out. The same gyro and the same stage must be
+    there; if the gyro was switched off meanwhile it gets a bias of its own for the rest.
 
     \b
       northfinder resume records/north-20260101T120000.000000Z.sqlite
+      northfinder resume records/north-20260101T120000.000000Z.sqlite --gyro native:/dev/ttyUSB2 --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
     with Record(file) as record:
         rest = remainder_of(record)

@@ -28,6 +28,7 @@ def command(*, record: Path, as_json: bool) -> None:
 
     \b
       northfinder show records/north-20260101T120000.000000Z.sqlite
+      northfinder show records/north-20260101T120000.000000Z.sqlite --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
     found = page(record)
     if as_json:
