@@ -99,6 +99,20 @@ def test_a_list_of_records_is_a_line_each(
     lock.release()
 
 
+def test_a_fix_that_failed_is_not_listed_like_any_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whoever reads an azimuth off the list, or off the page, sees that it must not be trusted."""
+    checks = [{"decisive": False, "passed": False}, {"decisive": True, "passed": True}]
+    for name, failed in (("a", []), ("b", [{"decisive": True, "passed": False}])):
+        with Recorder(tmp_path / f"{name}.sqlite", lambda: 1.0) as recorder:
+            recorder.add_fix({"azimuth_deg": 33.0, "azimuth_sd_deg": 0.5, "checks": checks + failed})
+    listed = json_of(capsys, "records", str(tmp_path))["records"]
+    assert [line["trustworthy"] for line in listed] == [False, True]
+    lines = run(capsys, "records", str(tmp_path))[1].splitlines()
+    assert [line.split()[:4][-1] == "!" for line in lines[1:]] == [True, False]
+    assert "not to be trusted" in run(capsys, "show", str(tmp_path / "b.sqlite"))[1]
+    assert "not to be trusted" not in run(capsys, "show", str(tmp_path / "a.sqlite"))[1]
+
+
 def test_show_tells_all_but_the_samples(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Devices, steps, events and fix; strings from devices do nothing to the terminal."""
     code, out, _ = run(capsys, "show", str(folder / "a.sqlite"))

@@ -29,7 +29,8 @@ _PLAN_WIDTH = 14
 def command(*, folder: Path, as_json: bool) -> None:
     """List the records in DIR, by default records/, the newest first.
 
-    In place of the azimuth of a record without a fix stands why there is none. Names come last and are never cut.
+    In place of the azimuth of a record without a fix stands why there is none; an azimuth with ! must not be trusted,
+    since a decisive check of its fix has failed. Names come last and are never cut.
 
     \b
       northfinder records
@@ -56,7 +57,7 @@ def _aligned(lines: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the head and a line for each record, all cells of a column equally wide."""
     rows = [_cells(line) for line in lines]
     widths = [max(map(cell_len, column)) for column in zip(_HEAD, *rows, strict=True)]
-    styles = ("bold", *(_STYLE[line["state"]] for line in lines))
+    styles = ("bold", *("red" if line["trustworthy"] is False else _STYLE[line["state"]] for line in lines))
     for style, (outcome, plan, size, name) in zip(styles, (_HEAD, *rows), strict=True):
         first, second = _padded(outcome, widths[0]), _padded(plan, widths[1])
         yield f"[{style}]{first}[/{style}]  {second}  {size:>{widths[2]}}  {escape(name)}"
@@ -79,7 +80,8 @@ def _cells(line: dict[str, Any]) -> tuple[str, str, str, str]:
 def _outcome(line: dict[str, Any]) -> str:
     """Return the azimuth, or else how far the measurement came."""
     if line["state"] == "complete":
-        return with_sd(line["azimuth_deg"], line["azimuth_sd_deg"], width=7) or "complete"
+        mark = " !" if line["trustworthy"] is False else ""
+        return (with_sd(line["azimuth_deg"], line["azimuth_sd_deg"], width=7) or "complete") + mark
     steps = str(line["steps"] or "").removesuffix(" steps").replace(" of the ", "/")
     return f"{line['state']}, {steps}" if "/" in steps else str(line["state"])
 

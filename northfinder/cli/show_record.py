@@ -56,6 +56,8 @@ def _facts(found: Mapping[str, Any]) -> Table:
         value = with_sd(found[f"{name}_deg"], found[f"{name}_sd_deg"])
         if value:
             table.add_row(name, f"{value} deg")
+    if found["trustworthy"] is False:
+        table.add_row("", "[red]not to be trusted: a decisive check has failed, northfinder solve says which[/red]")
     return table
 
 

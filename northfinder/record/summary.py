@@ -39,7 +39,8 @@ def summary(path: Path) -> dict[str, Any]:
     written = is_being_written(path)  # before the database is opened: SQLite would lose its locks
     line: dict[str, Any] = {
         "record": str(path), "state": "damaged", "started_utc_s": None, "plan": None, "steps": None, "gyro": None,
-        "azimuth_deg": None, "azimuth_sd_deg": None, "latitude_deg": None, "latitude_sd_deg": None, "n_notes": 0,
+        "azimuth_deg": None, "azimuth_sd_deg": None, "latitude_deg": None, "latitude_sd_deg": None, "trustworthy": None,
+        "n_notes": 0,
         "size_bytes": 0, "problem": None,
     }  # fmt: skip
     with suppress(OSError):
@@ -63,8 +64,16 @@ def _facts(record: Record, *, written: bool) -> dict[str, Any]:
         "plan": _entries(record.meta("plan")).get("name"),
         "steps": completeness(record)["steps"],
         "gyro": f"{gyro.get('model', '')} {gyro.get('serial_number', '')}".strip() or None,
+        "trustworthy": _is_trustworthy(fix),
         "n_notes": len(record.notes()),
     } | {name: fix.get(name) for name in names}
+
+
+def _is_trustworthy(fix: dict[str, Any]) -> bool | None:
+    """Return whether all decisive checks of a fix have passed, None if there are none."""
+    checks = fix.get("checks")
+    decisive = [each for each in map(_entries, checks if isinstance(checks, list) else []) if each.get("decisive")]
+    return all(each.get("passed") is True for each in decisive) if decisive else None
 
 
 def _entries(value: Any) -> dict[str, Any]:  # noqa: ANN401  # whatever the record holds
