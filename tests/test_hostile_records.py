@@ -58,6 +58,17 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path, command: str) -> None:
     assert len(ended.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize("command", ["show", "check", "solve", "export", "note"])
+@pytest.mark.parametrize("ending", ["-journal", "-wal", "-shm"])
+def test_a_pipe_beside_the_record_is_not_waited_for(tmp_path: Path, command: str, ending: str) -> None:
+    """SQLite would open it, as a rest of what was cut off."""
+    path = make_record(tmp_path / "r.sqlite", 3)
+    os.mkfifo(f"{path}{ending}")
+    ended = in_time(*arguments(command, path))
+    assert (ended.returncode, ended.stdout) == (5, "")
+    assert f"found r.sqlite{ending}, expected a file there or nothing" in ended.stderr
+
+
 def test_a_pipe_in_the_folder_is_listed_as_damaged(tmp_path: Path) -> None:
     """The other records are listed, and the newest of them takes the note."""
     os.mkfifo(tmp_path / "z.sqlite")

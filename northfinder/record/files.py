@@ -24,6 +24,14 @@ def require_file(path: Path) -> None:
         raise RecordError(f"{path}: cannot be read: found {found}, expected a file")
 
 
+def require_database(path: Path) -> None:
+    """Raise RecordError unless `path`, and all that SQLite would open with it, are plain files."""
+    require_file(path)
+    for beside in (f"{os.path.realpath(path)}{ending}" for ending in ("-journal", "-wal", "-shm")):
+        if os.path.lexists(beside) and not os.path.isfile(beside):  # noqa: PTH113  # as below
+            raise RecordError(f"{path}: cannot be read: found {Path(beside).name}, expected a file there or nothing")
+
+
 def log_of(path: Path) -> Path:
     """Return where SQLite keeps the log of the record `path`: beside the file itself, not beside a link to it."""
     return Path(f"{os.path.realpath(path)}-wal")

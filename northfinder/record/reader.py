@@ -22,7 +22,7 @@ import numpy as np
 from drivers.api import GyroStatus, RateBlock, RateCounts, StageMode, StageState
 from northfinder.errors import RecordError
 from northfinder.record.block_columns import BlockColumns
-from northfinder.record.files import has_log, log_of, require_file
+from northfinder.record.files import has_log, log_of, require_database
 from northfinder.record.schema import (
     APPLICATION_ID,
     MAX_BLOCK_BYTES,
@@ -94,7 +94,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
 
     Raises RecordError if it is no record of a version this program knows.
     """
-    require_file(path)
+    require_database(path)
     with one_line(path, "read"):
         db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_ROW_BYTES)
