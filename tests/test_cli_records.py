@@ -1,6 +1,7 @@
 """The commands about records, as users meet them: output, JSON and exit codes."""
 
 import json
+import os
 import shutil
 import sqlite3
 from pathlib import Path
@@ -12,7 +13,7 @@ from recording import fill, make_record, span
 from northfinder.cli import main
 from northfinder.errors import RecordError
 from northfinder.record import Record
-from northfinder.record.lock import RecordLock
+from northfinder.record.lock import RecordLock, _locked, is_being_written
 from northfinder.record.notes import add_note
 from northfinder.record.recorder import Recorder
 
@@ -200,6 +201,18 @@ def test_a_record_has_one_writer(tmp_path: Path) -> None:
         Recorder(path, lambda: 1.0, resume=True)
     lock.release()
     Recorder(path, lambda: 1.0, resume=True).close()
+
+
+def test_who_asks_for_a_writer_is_none(tmp_path: Path) -> None:
+    """Two commands that look at a record in the same moment do not take each other for its writer."""
+    path = make_record(tmp_path / "r.sqlite", 3)
+    asking = _locked(path, shared=True)
+    assert asking is not None
+    assert not is_being_written(path)
+    os.close(asking)
+    lock = RecordLock(path)
+    assert is_being_written(path)
+    lock.release()
 
 
 @pytest.mark.parametrize("command", ["show", "check", "recover", "resume", "export"])

@@ -20,7 +20,7 @@ class RecordLock:
         """Take the lock. Raises RecordError if another process has it."""
         self._file: int | None = None
         try:
-            self._file = _locked(path)
+            self._file = _locked(path, shared=False)
         except BlockingIOError:
             raise RecordError(f"the record {path} is being written by another process") from None
         except OSError as error:
@@ -36,7 +36,7 @@ class RecordLock:
 def is_being_written(path: Path) -> bool:
     """Return whether a process holds the record's lock; False if that cannot be told."""
     try:
-        file = _locked(path)
+        file = _locked(path, shared=True)  # two who ask at once are no writer to each other
     except OSError as error:
         return isinstance(error, BlockingIOError)
     if file is not None:
@@ -44,13 +44,13 @@ def is_being_written(path: Path) -> bool:
     return False
 
 
-def _locked(path: Path) -> int | None:
+def _locked(path: Path, *, shared: bool) -> int | None:
     """Return a handle that holds the lock, None where there are no locks. Raises BlockingIOError if it is taken."""
     if fcntl is None:
         return None
     file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe is not waited for
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except OSError:
         os.close(file)
         raise
