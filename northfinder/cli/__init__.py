@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import math
 import os
+import select
 import signal
 import sys
 import threading
@@ -116,7 +117,10 @@ def program() -> NoReturn:
         signal.signal(number, interrupt)
     try:
         main()
-    except _Interrupted:  # all is in order again; what was still to be said would be said in vain
+    except _Interrupted:  # all is in order again; what else was still to be said may have nobody to read it
+        with suppress(OSError, ValueError):
+            if select.select([], [sys.stderr], [], 0.0)[1]:
+                os.write(sys.stderr.fileno(), b"northfinder: interrupted\n")
         os._exit(EXIT_INTERRUPTED)
     finally:
         for number in signals:  # too late for another exit code

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 
-from northfinder.cli.ending import tidied_up
 from northfinder.cli.options import FILE
 from northfinder.cli.show import print_json
 from northfinder.export import FORMATS, export_record
@@ -30,7 +29,7 @@ def command(*, file: Path, kind: str, out: Path | None, as_json: bool) -> None:
       northfinder export records/north-20260101T120000.000000Z.sqlite --to csv -o samples.csv
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
     out = out or file.parent / f"{file.stem}.{kind}"
-    with tidied_up(), Record(file) as record:
+    with Record(file) as record:
         n_samples = export_record(record, out, kind)
     if as_json:
         print_json({"file": str(out), "n_samples": n_samples})

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 
-from northfinder.cli.ending import tidied_up
 from northfinder.cli.options import FILE
 from northfinder.cli.show import print_json
 from northfinder.record.recovery import recover
@@ -28,8 +27,7 @@ def command(*, record: Path, out: Path | None, as_json: bool) -> None:
       northfinder recover records/north-20260101T120000.000000Z.sqlite --out saved.sqlite --json
     """  # noqa: D301  # \b is click's mark to keep these lines as they are
     out = out or record.parent / f"{record.stem}-recovered{record.suffix}"
-    with tidied_up():
-        salvage = recover(record, out)
+    salvage = recover(record, out)
     if as_json:
         print_json({"record": str(out), "found": salvage.found, "lost": salvage.lost, "closed": salvage.closed})
         return
