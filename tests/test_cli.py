@@ -17,9 +17,13 @@ from pathlib import Path
 import fastcrc
 import pytest
 from cobs import cobs
+from rich.console import Console
 
-from northfinder.cli import main
+from drivers.api import DeviceIdentity
+from drivers.discovery import Identification
+from northfinder.cli import devices, doctor, main
 from northfinder.cli.solve import command as solve_command
+from northfinder.doctor import Finding, Verdict
 from northfinder.record import Record
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -294,3 +298,12 @@ def test_a_measurement_starts_without_what_is_slow_to_import() -> None:
     program = "import sys, northfinder.cli.find; print([m for m in ('scipy.stats', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_what_devices_say_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    """Brackets in a model's name or in a finding are shown as they stand, and break nothing."""
+    who = DeviceIdentity(kind="gyro", model="[/red]x[bold]", serial_number="7")
+    Console(width=200).print(devices._table([Identification(address="tty[0]", identity=who, remark="[link=x]")]))
+    doctor._show([Finding(verdict=Verdict.PASSED, name="links", sentence="said [/] and [red]")], as_json=False)
+    out = capsys.readouterr().out
+    assert all(text in out for text in ("[/red]x[bold]", "tty[0]", "[link=x]", "said [/] and [red]"))

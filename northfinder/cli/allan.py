@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from northfinder.cli.show import print_json
+from northfinder.cli.show import print_json, safe
 from northfinder.errors import EstimateError
 from northfinder.estimation.allan import AllanCurve, allan_curve
 from northfinder.estimation.noise_identification import Identification, identify
@@ -102,7 +102,7 @@ def _print(series: RateSeries, identified: Identification, curve: AllanCurve, re
         f" mean rate {result['mean_rate_dph']:.4g} deg/h"
     )
     for note in series.notes:
-        console.print(f"[yellow]note[/yellow] {printable(note)}")
+        console.print(f"[yellow]note[/yellow] {safe(note)}")
     console.print(_coefficients(identified))
     if identified.model_error:
         console.print(
@@ -111,7 +111,7 @@ def _print(series: RateSeries, identified: Identification, curve: AllanCurve, re
         )
     console.print(_deviations(curve, result["allan"]))
     if "profile" in result:
-        console.print(f"profile saved: {printable(result['profile'])}")
+        console.print(f"profile saved: {safe(result['profile'])}")
 
 
 def _coefficients(identified: Identification) -> Table:

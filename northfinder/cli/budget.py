@@ -11,12 +11,11 @@ from rich.console import Console
 from northfinder.adaptive import Wishes, make_plan
 from northfinder.budget_report import budget_table
 from northfinder.calibration import read_calibration
-from northfinder.cli.show import print_json
+from northfinder.cli.show import print_json, safe
 from northfinder.errors import ConfigError
 from northfinder.estimation.planning import Truth, planned_means
 from northfinder.plans import timetable
 from northfinder.solution import Assumptions, fix_to_json, solve, supplement
-from northfinder.text import printable
 from northfinder.turns import BLOCK_PAUSE, Turns
 
 _POSITIVE = click.FloatRange(min=0.0, min_open=True)
@@ -95,9 +94,9 @@ def command(
     if as_json:
         print_json(result)
         return
-    title = f"{printable(course.name)}, {result['duration_s']:.0f} s, with {printable(profile)} at {latitude_deg:g} deg"
+    title = f"{safe(course.name)}, {result['duration_s']:.0f} s, with {safe(profile)} at {latitude_deg:g} deg"
     Console().print(budget_table(result["budget"], title=title))
     if result["latitude_deg"] is None:
-        Console().print(f"latitude: {result['latitude_reason']}")
+        Console().print(f"latitude: {safe(result['latitude_reason'])}")
     for note in result["notes"]:
-        Console().print(f"note: {note}")
+        Console().print(f"note: {safe(note)}")

@@ -15,11 +15,10 @@ from rich.table import Table
 
 from northfinder.calibrate import Truth, calibrate_records
 from northfinder.calibration import Calibration, Model, save_calibration
-from northfinder.cli.show import print_json
+from northfinder.cli.show import print_json, safe
 from northfinder.errors import ConfigError
 from northfinder.estimation.calibration import Constants
 from northfinder.profile import find_profile
-from northfinder.text import printable
 
 
 @click.command("calibrate")
@@ -116,7 +115,7 @@ def _verdict(calibration: Calibration) -> str:
 def _print(calibration: Calibration, constants: Constants, save: Path | None) -> None:
     drift, ratio, azimuth = calibration.acceleration_sensitive, calibration.ratio, calibration.azimuth
     table = Table("", "", show_header=False, box=SIMPLE)
-    table.add_row("gyro", printable(f"{calibration.gyro_model} {calibration.serial_number}"))
+    table.add_row("gyro", safe(f"{calibration.gyro_model} {calibration.serial_number}"))
     table.add_row("valid", f"{calibration.date} to {calibration.valid_until}")
     if calibration.temperature_min_c is not None:
         table.add_row("temperature", f"{calibration.temperature_min_c:.1f} to {calibration.temperature_max_c:.1f} C")
@@ -132,7 +131,7 @@ def _print(calibration: Calibration, constants: Constants, save: Path | None) ->
     if azimuth is not None:
         table.add_row("azimuth offset", f"{_with_sd(azimuth.offset_deg, azimuth.offset_sd_deg)} deg")
     if save is not None:
-        table.add_row("saved", printable(str(save)))
+        table.add_row("saved", safe(save))
     Console().print(table)
 
 

@@ -9,8 +9,7 @@ from rich.table import Table
 from drivers.discovery import Identification, identify
 from drivers.transport.clock import SystemClock
 from drivers.transport.serial_port import list_ports
-from northfinder.cli.show import print_json
-from northfinder.text import printable
+from northfinder.cli.show import print_json, safe
 
 
 @click.command("devices")
@@ -41,5 +40,5 @@ def _table(found: list[Identification]) -> Table:
         identity = each.identity
         who = ("", "", "") if identity is None else (identity.kind, identity.model, identity.serial_number)
         baudrate = "" if each.baudrate is None else str(each.baudrate)
-        table.add_row(*(printable(cell) for cell in (each.address, baudrate, *who, each.remark)))
+        table.add_row(*(safe(cell) for cell in (each.address, baudrate, *who, each.remark)))
     return table

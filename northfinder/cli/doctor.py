@@ -21,14 +21,13 @@ from northfinder import doctor
 from northfinder.adaptive import Wishes
 from northfinder.cli import EXIT_FINDING
 from northfinder.cli.bench import gyro_of, named_bench, stage_of, stop_on_signal
-from northfinder.cli.show import print_json
+from northfinder.cli.show import print_json, safe
 from northfinder.config import Config, GyroTable, StageTable
 from northfinder.diagnosis import judged
 from northfinder.doctor import Finding, Verdict
 from northfinder.errors import ConfigError
 from northfinder.examination import Examination
 from northfinder.solution import Assumptions
-from northfinder.text import printable
 
 _CAN_DRIVERS = ("canopen-gyro", "cia402-stage")
 _MARKS = {Verdict.PASSED: "[green]pass[/green]", Verdict.FAILED: "[red]FAIL[/red]", Verdict.SKIPPED: "skip"}
@@ -142,7 +141,7 @@ def _show(findings: list[Finding], *, as_json: bool) -> None:
     else:
         table = Table(box=None, show_header=False)
         for each in findings:
-            table.add_row(_MARKS[each.verdict], each.name, printable(each.sentence, max_length=500))
+            table.add_row(_MARKS[each.verdict], each.name, safe(each.sentence))
         Console().print(table)
     if failed:
         click.get_current_context().exit(EXIT_FINDING)

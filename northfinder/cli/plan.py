@@ -12,7 +12,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Column, Table
 
-from northfinder.cli.show import print_json
+from northfinder.cli.show import print_json, safe
 from northfinder.errors import ConfigError
 from northfinder.estimation.planning import Truth
 from northfinder.plan_report import best_of_each, candidate_json, curve_json, survey
@@ -149,4 +149,4 @@ def _print(result: dict[str, Any]) -> None:
     sd, latitude = best["azimuth_sd_deg"], result["truth_latitude_deg"]
     console.print(f"best: {best['plan']}, azimuth sd {sd:.4f} deg at latitude {latitude:g} deg")
     for name, reason in result["refused"].items():
-        console.print(f"{name}: {printable(reason)}")
+        console.print(f"{name}: {safe(reason)}")

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from northfinder.cli.options import FILE
-from northfinder.cli.show import print_json
+from northfinder.cli.show import print_json, safe
 from northfinder.record.summary import MAX_LISTED, list_records
 from northfinder.text import printable
 
@@ -92,11 +92,6 @@ def utc_text(instant: float) -> str:
         return f"{datetime.fromtimestamp(instant, UTC):%Y-%m-%d %H:%M:%S}"
     except (ValueError, OverflowError, OSError):
         return f"{instant:g} s"
-
-
-def safe(value: object) -> str:
-    """Return foreign text such that it is shown as it stands, and does nothing."""
-    return escape(printable(str(value)))
 
 
 def with_sd(value: object, sd: object, *, width: int = 0) -> str:

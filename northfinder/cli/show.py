@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
@@ -18,6 +19,11 @@ from northfinder.text import json_text, printable
 
 #: A note longer than this is cut.
 _MAX_NOTE = 500
+
+
+def safe(value: object, *, max_length: int = 500) -> str:
+    """Return what a file or a device says such that a terminal shows it as it stands, and does nothing."""
+    return escape(printable(str(value), max_length=max_length))
 
 
 def print_json(value: object) -> None:

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from northfinder.cli.options import FILE
-from northfinder.cli.records import safe, utc_text, with_sd
-from northfinder.cli.show import print_json
+from northfinder.cli.records import utc_text, with_sd
+from northfinder.cli.show import print_json, safe
 from northfinder.record.summary import page
 
 _MAX_EVENTS = 200

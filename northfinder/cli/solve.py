@@ -13,12 +13,11 @@ from rich.table import Table
 
 from northfinder.calibration import read_calibration
 from northfinder.cli.options import FILE, estimation_options, position_options
-from northfinder.cli.show import print_json, print_result, require_trustworthy
+from northfinder.cli.show import print_json, print_result, require_trustworthy, safe
 from northfinder.geodesy import Place
 from northfinder.record.files import require_file
 from northfinder.solution import Assumptions, Method
 from northfinder.solve_file import solve_file
-from northfinder.text import printable
 
 #: Options, and which of the assumptions that a record holds each of them changes.
 _REVISED = {name: name for name in ("latitude_deg", "latitude_sd_deg", "profile", "g_drift_dph", "method")} | {
@@ -98,7 +97,7 @@ def _table(result: dict[str, Any]) -> Table:
     """Return any plain result as rows of name and value."""
     table = Table("", "", show_header=False)
     for name, value in _flat(result):
-        table.add_row(printable(name), printable(value))
+        table.add_row(safe(name), safe(value))
     return table
 
 
