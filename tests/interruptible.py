@@ -114,8 +114,8 @@ class Host:
         """Let it run for so long, in s, or to its end."""
         end = time.monotonic() + duration
         while self._terminal is not None and (left := end - time.monotonic()) > 0:
-            if select.select([self._terminal], [], [], left)[0]:
-                os.read(self._terminal, 4096)
+            if select.select([self._terminal], [], [], left)[0] and not _taken(self._terminal):
+                break
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(max(0.0, end - time.monotonic()))
 
@@ -148,6 +148,14 @@ class Host:
         for end in (self._terminal, None if self._how == "closed terminal" else self._pipe):
             if end is not None:
                 os.close(end)
+
+
+def _taken(terminal: int) -> bytes:
+    """Return what was said on a terminal, nothing once whoever spoke there has ended."""
+    try:
+        return os.read(terminal, 4096)
+    except OSError:
+        return b""
 
 
 @contextlib.contextmanager

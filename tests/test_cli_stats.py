@@ -111,7 +111,7 @@ def test_what_is_no_campaign_is_said(records: list[Path], tmp_path: Path) -> Non
         stats(records[0])
     with pytest.raises(ConfigError, match=r"no pause of 5 h: the longest between two measurements is 0.5 h"):
         stats(*records, "--pause", 5)
-    with pytest.raises(RecordError, match="no record"):
+    with pytest.raises(RecordError, match=r"none.sqlite: cannot be read: No such file"):
         stats(records[0], tmp_path / "none.sqlite")
 
 
