@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from interruptible import BENCHES, INTERRUPTIONS, LiveBench, interruptible
 
+from drivers.transport.clock import SystemClock
+from northfinder.cli.bench import stop_on_signal
 from northfinder.errors import RecordError
 from northfinder.record import Record
 from northfinder.record.check import examine
@@ -131,6 +133,19 @@ def test_a_result_that_nobody_takes(tmp_path: Path) -> None:
     assert examine(only_record(tmp_path / "records")).sound
 
 
+def test_a_stop_that_comes_too_late() -> None:
+    """When the measurement has just ended, a Ctrl-C is meant for what follows; else the result might wait for ever."""
+
+    def stopped_at_the_end() -> None:
+        with stop_on_signal(SystemClock()) as stop_requested:
+            assert not stop_requested()
+            signal.raise_signal(signal.SIGINT)
+            assert stop_requested()
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped_at_the_end()
+
+
 def test_what_the_starter_wants_ignored(tmp_path: Path) -> None:
     """Under nohup a hang-up stops nothing; a Ctrl-C does, also in the background, where shells let it be ignored."""
     ignoring = ["env", "--ignore-signal=HUP", "--ignore-signal=INT"]
@@ -202,7 +217,7 @@ class Ended:
     moved: bool  #: whether the stage did when it was interrupted
     at_rest_after: float  #: s, negative if it was before
     state: str  #: of the measurement
-    code: int
+    code: int | None  #: None if it did not end
     sound: bool  #: whether the record is, if there is one
 
     @property
@@ -217,7 +232,10 @@ def interrupted(how: str, rng: np.random.Generator, folder: Path) -> Ended:
         with interruptible(how, [*FIND_ON, *bench.options], folder) as host:
             host.go_on(rng.uniform(0.0, WHOLE_RUN))
             instant, moved = host.interrupt(), bench.stage_moves()
-            code = host.wait(TIMEOUT)
+            try:
+                code = host.wait(TIMEOUT)
+            except subprocess.TimeoutExpired:
+                code = None
         assert not bench.stage_moves()
         at_rest_after = bench.at_rest_since() - instant
     records = list((folder / "records").glob("*"))

@@ -225,6 +225,7 @@ def test_killed_host_stops_the_stage(start: Start, speed: str) -> None:
         lines: list[str] = []
         while sum(line.startswith(f"{MOVING} ") for line in lines) < 10:
             lines.append(host.stdout.readline())
+            assert lines[-1], "the host has ended"
         host.kill()
         acknowledged_us = max(int(line.split()[1]) for line in [*lines, *host.stdout])
         fault = None

@@ -68,7 +68,10 @@ def _opened(opener: Callable[..., Device], address: str, clock: Clock, **options
 
 @contextmanager
 def stop_on_signal(clock: SystemClock) -> Iterator[Callable[[], bool]]:
-    """Let the first Ctrl-C, termination or hang-up ask for a stop; yield the question whether one was asked for."""
+    """Let the first Ctrl-C, termination or hang-up ask for a stop; yield the question whether one was asked for.
+
+    One that came when there was nothing left to stop interrupts what follows: nobody may be there to read it.
+    """
     requested = False
 
     def request(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  # the signal module's signature
@@ -82,3 +85,5 @@ def stop_on_signal(clock: SystemClock) -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    if requested:
+        signal.raise_signal(signal.SIGINT)

@@ -118,6 +118,8 @@ def command(**given: Any) -> None:  # noqa: ANN401  # click's keywords, those of
         watcher = SilentDisplay() if options.quiet else display  # what shows nothing need not run aside
         results: list[dict[str, Any]] = []
         for _ in range(options.repeat):
+            if stop_requested():
+                break
             begun = time.monotonic() if results else STARTED
             measurement = Measurement(
                 open_gyro=partial(planned_gyro, config.gyro, clock, assumptions.calibration, plan.name),
