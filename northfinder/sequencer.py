@@ -181,10 +181,9 @@ class Sequencer:
     _state: StageState | None = None
     _now: State = State.CONNECT
     _failure: Exception | None = None
-    _flagged: dict[tuple[str, str, str], int] = field(default_factory=dict)  #: blocks that the gyro flagged, as `_told`
-    _told: dict[tuple[str, str, str], int] = field(
-        default_factory=dict
-    )  #: kind of event, device, what: how often up to now
+    #: Kind of event, device and what went wrong: how often up to now, and what of it are blocks that the gyro flagged.
+    _told: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    _flagged: dict[tuple[str, str, str], int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Go on after what was done before."""

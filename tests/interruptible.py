@@ -29,8 +29,6 @@ SIGNALS = {"Ctrl-C": signal.SIGINT, "SIGTERM": signal.SIGTERM, "SIGHUP": signal.
 #: Signals, a terminal that is closed, and a Ctrl-C while nobody takes what the program says.
 INTERRUPTIONS = (*SIGNALS, "closed terminal", "full pipe")
 PIPE_SIZE = 4096  #: bytes, the smallest pipe there is
-
-
 #: Benches by the devices on them.
 BENCHES = ("native", "native and zaber", "CAN")
 

@@ -118,13 +118,18 @@ def program() -> NoReturn:
     try:
         main()
     except _Interrupted:  # all is in order again; what else was still to be said may have nobody to read it
+        _ignore(signals)
         with suppress(OSError, ValueError):
             if select.select([], [sys.stderr], [], 0.0)[1]:
                 os.write(sys.stderr.fileno(), b"northfinder: interrupted\n")
         os._exit(EXIT_INTERRUPTED)
     finally:
-        for number in signals:  # too late for another exit code
-            signal.signal(number, signal.SIG_IGN)
+        _ignore(signals)  # it is too late for another exit code
+
+
+def _ignore(signals: list[signal.Signals]) -> None:
+    for number in signals:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
