@@ -26,7 +26,7 @@ MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and 
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little
 UNREAD_LOOK_US = 200  #: between looks at whether the host has read what it need not acknowledge
 CATCH_UP_US = 1_000_000  #: of wall time, the most that is made up for
-LONGEST_STEP_US = 100_000  #: of wall time at once; the emulator looks at its lines twice as often if it is let
+LONGEST_STEP_US = 60_000  #: of wall time at once; the emulator looks at its lines more often than that if it is let
 CONTROL_US = 20_000  #: the stage counts as in motion for so long after its drives were last told something
 
 

@@ -8,8 +8,9 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from northfinder.record.database import open_for_reading
 from northfinder.record.lock import is_being_written
-from northfinder.record.reader import CLOSED, open_for_reading
+from northfinder.record.reader import CLOSED
 from northfinder.record.recovery import closing_counts
 from northfinder.record.schema import NAMES, TABLES, Row, is_sound
 

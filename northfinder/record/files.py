@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import secrets
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from northfinder.errors import RecordError
 
@@ -51,14 +52,18 @@ def new_file(out: Path) -> Iterator[Path]:
     if os.path.lexists(out):
         raise RecordError(f"{out} exists already: nothing is overwritten")
     make_folder(out.parent)
+    folder = out.parent / f"northfinder-{secrets.token_hex(8)}"
     try:
-        with TemporaryDirectory(prefix="northfinder-", dir=out.parent) as folder:
-            part = Path(folder, out.name)
-            yield part
-            part.rename(out)
+        folder.mkdir(
+            mode=0o700
+        )  # named before it is made: whenever the program is interrupted, it is known what to remove
+        yield folder / out.name
+        (folder / out.name).rename(out)
         sync_folder(out.parent)
     except OSError as error:
         raise RecordError(f"{out} cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def make_folder(folder: Path) -> None:

@@ -6,7 +6,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from northfinder.record.reader import one_line, open_for_reading
+from northfinder.record.database import one_line, open_for_reading
 from northfinder.record.schema import INSERT, sealed
 from northfinder.text import printable
 
