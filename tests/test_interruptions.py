@@ -133,6 +133,15 @@ def test_a_result_that_nobody_takes(tmp_path: Path) -> None:
     assert examine(only_record(tmp_path / "records")).sound
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Let a Ctrl-C interrupt, whatever those who started these tests want of it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_a_stop_that_comes_too_late() -> None:
     """When the measurement has just ended, a Ctrl-C is meant for what follows; else the result might wait for ever."""
 
