@@ -226,6 +226,7 @@ def test_killed_host_stops_the_stage(start: Start, speed: str) -> None:
         while sum(line.startswith(f"{MOVING} ") for line in lines) < 10:
             lines.append(host.stdout.readline())
             assert lines[-1], "the host has ended"
+            assert not lines[-1].startswith(f"{FAULT} "), "the host was too slow itself"
         host.kill()
         acknowledged_us = max(int(line.split()[1]) for line in [*lines, *host.stdout])
         fault = None
