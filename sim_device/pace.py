@@ -5,9 +5,10 @@ up: it goes from one thing that is due to the next, and holds as soon as a devic
 must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. Where hosts acknowledge nothing, it holds while they have
 not read what was sent, and for a stage that is polled, the last poll counts. So a run at full speed is a lockstep with
 the host. When the host stays away, time goes on at 1x from there, and a dead host trips the stage's watchdog as in
-reality: after a quarter of a second with the stage at rest, where a lost frame may be all there is to it; after a
-second while it moves, so that a host which is merely busy finds the same world again. At N times real time what was
-waited for a host is made up for, up to a second of it, so that N is what a whole run has if its host is fast enough.
+reality: after a quarter of a second with the stage at rest, where a lost frame may be all there is to it; a while later
+while it moves, so that a host which is merely busy finds the same world again, but one that waits for what was lost is
+not kept waiting for long. At N times real time what was waited for a host is made up for, up to a second of it, so that
+N is what a whole run has if its host is fast enough.
 
 Time in which the emulator itself got no processor does not pass in the world (`WallTime`): what its hosts said
 meanwhile is with the devices late, and a watchdog would take that for their silence.
@@ -20,7 +21,7 @@ from collections.abc import Callable
 
 from sim_device.bench import Seat, World
 
-MOVING_PATIENCE_US = 1_000_000  #: wall time for which the world waits for the host while the stage moves
+MOVING_PATIENCE_US = 600_000  #: wall time for which the world waits for the host while the stage moves; hosts wait 1 s
 REST_PATIENCE_US = 250_000  #: the same with the stage at rest
 MOVING_WINDOW_US = 150_000  #: stage in motion: its status period of 100 ms and a little, well under its watchdog
 REST_WINDOW_US = 1_100_000  #: stage at rest: its status period of 1 s and a little

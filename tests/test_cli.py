@@ -226,6 +226,18 @@ def test_devices_exchanged(tmp_path: Path) -> None:
     assert "rotation stage, a gyro was expected" in only_line(done.stderr)
 
 
+def test_damaged_frames_hold_up_no_measurement_at_full_speed(tmp_path: Path) -> None:
+    """The emulator waits for the word of a frame that was lost, but less long than a host does for the next one."""
+    with emulated("--speed", "max", "--fault", "stage:flip=4e-4", "--fault", "gyro:flip=1e-5") as addresses:
+        found = ["--gyro", addresses["gyro"], "--stage", addresses["stage"], "--profile", "tvg43", "--time", "120"]
+        done = northfinder("find", *found, "--latitude", "50.429", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (path,) = (tmp_path / "records").iterdir()
+    with Record(path) as record:
+        kinds = [kind for _, kind, detail in record.events() if detail.startswith("stage, slew")]
+    assert "link" in kinds
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_stage_and_closes_the_record(tmp_path: Path, number: int) -> None:
     """Ctrl-C, termination and hang-up: exit code 130, and one closed file that says it was stopped."""
