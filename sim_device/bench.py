@@ -105,6 +105,8 @@ class Line(Seat):
         sent = self.device.poll(self.bench.now_us - self.epoch_us, self.room)
         if sent:
             self._out += sent
+            if self.room is not None:  # several blocks may be due before the line is looked at again
+                self.room = max(0, self.room - len(sent))
         self._note_due()
 
     def restart(self, device: Hosted) -> None:
