@@ -1,14 +1,14 @@
 """How the world's time runs against wall time while the emulator is served, at real time or faster.
 
 At 1x world time is wall time. Faster, the world never runs slower than that, and runs ahead only while the host keeps
-up: it goes from one thing that is due to the next, and holds as soon as a device has sent a stream frame that its host
-must acknowledge (``seen_time_us`` of HEARTBEAT) and has not. Where hosts acknowledge nothing, it holds while they have
-not read what was sent, and for a stage that is polled, the last poll counts. So a run at full speed is a lockstep with
-the host. When the host stays away, time goes on at 1x from there, and a dead host trips the stage's watchdog as in
-reality: after a quarter of a second with the stage at rest, where a lost frame may be all there is to it; a while later
-while it moves, so that a host which is merely busy finds the same world again, but one that waits for what was lost is
-not kept waiting for long. At N times real time what was waited for a host is made up for, up to a second of it, so that
-N is what a whole run has if its host is fast enough.
+up: it goes from one thing that is due to the next, and holds as soon as a device has sent a stream frame that its
+host must acknowledge (``seen_time_us`` of HEARTBEAT) and has not; a host that goes on saying so has lost it, and is
+held up no longer. Where hosts acknowledge nothing, it holds while they have not read what was sent, and for a stage
+that is polled, the last poll counts. So a run at full speed is a lockstep with the host. When the host stays away,
+time goes on at 1x from there, and a dead host trips the stage's watchdog as in reality: after a quarter of a second
+with the stage at rest; a while later while it moves, so that a host which is merely busy finds the same world again.
+At N times real time what was waited for a host is made up for, up to a second of it, so that N is what a whole run
+has if its host is fast enough.
 
 Time in which the emulator itself got no processor does not pass in the world (`WallTime`): what its hosts said
 meanwhile is with the devices late, and a watchdog would take that for their silence.

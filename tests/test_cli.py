@@ -227,7 +227,7 @@ def test_devices_exchanged(tmp_path: Path) -> None:
 
 
 def test_damaged_frames_hold_up_no_measurement_at_full_speed(tmp_path: Path) -> None:
-    """The emulator waits for the word of a frame that was lost, but less long than a host does for the next one."""
+    """Lost frames, those that tell of arrival among them, hold up neither the emulator nor the host."""
     with emulated("--speed", "max", "--fault", "stage:flip=4e-4", "--fault", "gyro:flip=1e-5") as addresses:
         found = ["--gyro", addresses["gyro"], "--stage", addresses["stage"], "--profile", "tvg43", "--time", "120"]
         done = northfinder("find", *found, "--latitude", "50.429", "--quiet", cwd=tmp_path)

@@ -288,7 +288,7 @@ def test_wider_limits_are_refused(field: int, value: int, offset: int) -> None:
 
 
 def test_status_keeps_its_rhythm() -> None:
-    """Once a second at rest, each period in motion, at once after a change; counted without a gap."""
+    """Once a second at rest, each period in motion and half a second after, at once after a change; all counted."""
     host, _ = _homed()
     host.run(5_000_000)
     times = [status(body).time_us for body in _statuses(host)][-4:]
@@ -298,6 +298,11 @@ def test_status_keeps_its_rhythm() -> None:
     host.run(1_000_000)
     times = [status(body).time_us for body in _statuses(host)][-10:]
     assert [later - sooner for sooner, later in pairwise(times)] == [100_000] * 9
+    host.run(10_000_000)
+    times = [
+        status(body).time_us for body in _statuses(host) if status(body).state == IDLE and status(body).move_id > 1
+    ]
+    assert [later - sooner for sooner, later in pairwise(times)][:7] == [100_000] * 5 + [1_000_000] * 2
     assert [status(body).count for body in _statuses(host)] == list(range(len(_statuses(host))))
 
 

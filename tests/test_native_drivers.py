@@ -18,7 +18,7 @@ from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, Li
 from drivers.native import NativeGyro, NativeStage
 from drivers.native.session import MAX_STREAM
 from drivers.protocol.framing import FrameDecoder, encode_frame
-from drivers.protocol.native import ANGLE_LSB, DEFINITION_HASH, MessageType, message_type, parse
+from drivers.protocol.native import ANGLE_LSB, DEFINITION_HASH, MessageType, StageCode, message_type, parse
 from drivers.transport.virtual import TimedDevice, VirtualClock, VirtualLink
 from sim_device.bench import SimBench
 
@@ -407,6 +407,23 @@ def test_a_stage_that_falls_silent_is_seen() -> None:
         with pytest.raises(DeviceTimeoutError, match="the stage on bench:stage has sent no status"):
             bench.serve(lambda _: False)
         assert bench.clock.now() - begun <= limit
+
+
+def test_a_lost_word_of_arrival_is_soon_made_up_for() -> None:
+    """The one status that tells of rest is lost: the next one comes as if the stage still moved."""
+    bench = Bench().homed()
+    arrivals: list[float] = []
+
+    def lose_the_first(body: bytes) -> bool:
+        if body[0] != MessageType.STAGE_STATUS or parse(body).state != StageCode.IDLE:
+            return True
+        arrivals.append(bench.clock.now())
+        return len(arrivals) > 1
+
+    bench.stage.move(radians(20), 0.0)
+    bench.stage_tap.to_host = lose_the_first
+    state = bench.serve(lambda state: state.in_position)
+    assert state.arrival_time - arrivals[0] <= 0.15
 
 
 def test_unplugging_is_a_link_error_and_close_raises_nothing() -> None:

@@ -329,6 +329,24 @@ def test_pace_with_a_host_that_dies(*, streams: bool) -> None:
     assert not pace.run_ahead()
 
 
+def test_pace_when_a_frame_is_lost() -> None:
+    """A host that says three times that it has read nothing newer has lost it: the world holds for it no longer."""
+    bench = SimBench("ideal")
+    bench.stage.feed(hello(), 0)
+    pace = Pace(bench, math.inf)
+    pace.advance(0)
+    while pace.run_ahead():
+        pass
+    held_us = bench.now_us
+    for _ in range(2):
+        bench.stage.feed(heartbeat(0), bench.now_us)
+        assert not pace.run_ahead()
+    bench.stage.feed(heartbeat(0), bench.now_us)
+    while pace.run_ahead():
+        pass
+    assert bench.now_us == held_us + 1_000_000
+
+
 def test_pace_of_a_self_test() -> None:
     """At full speed the wait for a self-test's end is skipped."""
     bench, decoder = SimBench("ideal"), Decoder()

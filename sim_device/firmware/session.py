@@ -49,6 +49,8 @@ LENGTHS = {
 }
 _HEADER = 9
 
+DEAF_BEATS = 3  #: heartbeats that tell nothing newer, after which what was last sent must be lost
+
 UNKNOWN_REQUEST = 1
 BAD_LENGTH = 2
 NO_SESSION = 3
@@ -83,7 +85,7 @@ class Session:
     number : int
         Number of the open session, 0 if none.
     seen_time_us : int
-        Newest device time that the host says it has read in this session.
+        Newest device time that the host says it has read in this session, or has evidently lost.
     heartbeat_us : int
         When the last HEARTBEAT of this session came.
     request_id : int
@@ -103,6 +105,7 @@ class Session:
         self._n_ignored = 0
         self._reply = b""  # to the last request; empty while that is at work
         self._outbox: list[bytes] = []
+        self._n_deaf = 0  # heartbeats that told nothing newer, since something was last sent
         self.n_waiting = 0
 
     @property
@@ -112,6 +115,7 @@ class Session:
 
     def send(self, encoded: bytes) -> None:
         """Put a whole frame in the queue."""
+        self._n_deaf = 0
         self._outbox.append(encoded)
         self.n_waiting += len(encoded)
 
@@ -181,7 +185,9 @@ class Session:
         _, number, seen_time_us = struct.unpack("<BIQ", body)
         if self.number and number == self.number:
             self.heartbeat_us = now_us
-            self.seen_time_us = max(self.seen_time_us, seen_time_us)
+            self._n_deaf = self._n_deaf + 1 if seen_time_us <= self.seen_time_us else 0
+            # one heartbeat may have been on its way, and one may go out before what has come is read
+            self.seen_time_us = max(self.seen_time_us, seen_time_us, now_us if self._n_deaf >= DEAF_BEATS else 0)
 
     def _is_new(self, body: bytes) -> bool:
         """Return whether to execute a request; refuse it, repeat its reply or stay silent if not."""

@@ -38,6 +38,7 @@ _HOMING_FAILED = 7
 _LOSE_HOMING = (RUNAWAY, ENCODER, _HOMING_FAILED)
 
 _REST_STATUS_US = 1_000_000
+_AFTERGLOW_US = 500_000  # after a motion, for which the status keeps its rhythm: that of arrival may be lost
 _REST_CHECK_US = 100_000
 _SETTLE_US = 1_000_000
 _HOMING_MARGIN = 360_000  # beyond the range, 10 deg
@@ -76,6 +77,7 @@ class StageDevice(Device):
         self._in_motion = False
         self._in_position = False
         self._motion_us = 0
+        self._moved_us = -_AFTERGLOW_US  # when it was last in motion
         self._suspected_us = -1  # since when the stage at rest is not where it rested
         self._move_id = 0
         self._tick_due_us = 0
@@ -259,6 +261,7 @@ class StageDevice(Device):
             self._latch(_WATCHDOG, now_us)
         if self._tick_due_us <= now_us:
             if self._in_motion:
+                self._moved_us = now_us
                 self._tick(now_us)
             else:
                 self._check_rest(now_us)
@@ -274,7 +277,8 @@ class StageDevice(Device):
         self._session.send(self._status(now_us))
         self.told_time_us = now_us
         self._status_count += 1
-        self._status_due_us = now_us + (self._config[6] * 1000 if self._in_motion else _REST_STATUS_US)
+        brisk = now_us < self._moved_us + _AFTERGLOW_US
+        self._status_due_us = now_us + (self._config[6] * 1000 if brisk or self._in_motion else _REST_STATUS_US)
 
     def _status(self, now_us: int) -> bytes:
         """Return the frame that tells the present state."""
