@@ -80,9 +80,10 @@ def measure(
     """
     with Recorder(measurement.record, utc, clock=clock.now, resume=measurement.resume) as recorder:
         earlier, reduction = _before(measurement)  # now that nobody else goes on with it
-        for key, value in measurement.meta.items():
-            recorder.set_meta(key, value)
-        recorder.set_meta("assumptions", measurement.assumptions)
+        facts = dict(measurement.meta) | {"assumptions": measurement.assumptions}
+        if not measurement.resume:  # else only once the devices have shown that they are the right ones
+            for key, value in facts.items():
+                recorder.set_meta(key, value)
         observer = _Observer(watcher, measurement.assumptions, reduction)
         sequencer = Sequencer(
             open_gyro=measurement.open_gyro,
@@ -92,6 +93,7 @@ def measure(
             clock=clock,
             observer=observer,
             settle=measurement.settle,
+            facts=facts if measurement.resume else {},
             stop_requested=stop_requested,
             earlier=earlier,
             fix=observer.estimate() if earlier.spans else None,

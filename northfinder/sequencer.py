@@ -10,7 +10,7 @@ slews in the stage's own time, so the same sequence runs against hardware and at
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol
@@ -167,6 +167,7 @@ class Sequencer:
     settle: float = 0.5  #: s of samples left out after each slew
     stop_requested: Callable[[], bool] = lambda: False
     earlier: Earlier = field(default_factory=Earlier)  #: what was done before an interruption
+    facts: Mapping[str, object] = field(default_factory=dict)  #: for the record, once the devices are the right ones
     gyro: Gyro | None = None
     stage: Stage | None = None
     identities: dict[str, DeviceIdentity] = field(default_factory=dict)
@@ -257,8 +258,8 @@ class Sequencer:
         self.identities = {"gyro": gyro.connect(), "stage": stage.connect()}
         # First, so that a record says nothing of devices that none of its samples are from.
         self.earlier.check(self.identities, sample_rate=gyro.sample_rate, n_axes=gyro.n_axes)
-        self.recorder.set_meta("identities", self.identities)
-        self.recorder.set_meta("sample_rate", gyro.sample_rate)
+        for key, value in {**self.facts, "identities": self.identities, "sample_rate": gyro.sample_rate}.items():
+            self.recorder.set_meta(key, value)
         self.plan.check(stage.limits)
         self.recorder.set_meta("plan", self.plan.outline())
         n_done = len(self.spans)

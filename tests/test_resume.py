@@ -3,7 +3,7 @@
 import math
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -99,13 +99,15 @@ def interrupted(bench: VirtualBench, path: Path, at: Callable[[Progress], bool])
     return path.with_name(f"cut-{path.name}")
 
 
-def resumed(bench: VirtualBench, path: Path, watcher: Cutter | None = None) -> Outcome:
+def resumed(
+    bench: VirtualBench, path: Path, watcher: Cutter | None = None, *, meta: Mapping[str, object] | None = None
+) -> Outcome:
     """Go on with a record."""
     with Record(path) as record:
         rest = remainder_of(record)
     measurement = Measurement(
         open_gyro=bench.open_gyro, open_stage=bench.open_stage, plan=rest.plan, settle=0.5,
-        assumptions=rest.assumptions, record=path, resume=True,
+        assumptions=rest.assumptions, record=path, resume=True, meta=meta or {},
     )  # fmt: skip
     return measure(measurement, clock=bench.clock, utc=bench.clock.now, watcher=watcher or Cutter(path, never))
 
@@ -193,11 +195,18 @@ def test_another_gyro_is_refused(tmp_path: Path) -> None:
     """The rest is measured with the gyro of the first part, or not at all; the record stays as it is."""
     bench = virtual_bench(seed=15)
     path = interrupted(bench, tmp_path / "r.sqlite", lambda now: (now.state, now.n_done) == (State.SLEW, 2))
+    elsewhere = {"config": {"gyro": {"address": "native:/dev/ttyUSB7"}}}
+    with Record(path) as record:
+        before = record.meta("config")
     with pytest.raises(ConfigError, match=r"same gyro: found tvg43 SIM-G16.* expected tvg43 SIM-G15"):
-        resumed(virtual_bench(seed=16), path)
+        resumed(virtual_bench(seed=16), path, meta=elsewhere)
     assert len(spans_of(path)) == 2
     with Record(path) as record:
         assert record.meta("identities")["gyro"]["serial_number"] == "SIM-G15"
+        assert record.meta("config") == before
+    resumed(bench, path, meta=elsewhere)
+    with Record(path) as record:
+        assert record.meta("config") == elsewhere["config"]
 
 
 def test_another_stage_is_refused() -> None:
