@@ -151,8 +151,17 @@ class Registers:
         Raises
         ------
         DeviceFaultError
-            If a register does not hold what was written.
+            If a register does not hold what was written, however often.
         """
+        for _ in range(ATTEMPTS):  # nothing answers a write: it may have been lost
+            refused = self._set_all(sample_rate)
+            if not refused:
+                return
+            self._window = None
+        raise DeviceFaultError(f"{self._link.name} does not take its {refused}")
+
+    def _set_all(self, sample_rate: float) -> str:
+        """Write all settings once; return what is not as it was written, empty if nothing."""
         rate, smoothing = epson.RATE_CODES[sample_rate], epson.filter_code(sample_rate)
         self.write(epson.SMPL_CTRL, high=rate)
         self.write(epson.FILTER_CTRL, low=smoothing)
@@ -171,23 +180,34 @@ class Registers:
         ):
             found = self.read(register) & mask
             if found != wanted:
-                raise DeviceFaultError(
-                    f"{self._link.name} does not take its {name}: register {register[1]:02X} holds {found:04X}, "
-                    f"{wanted:04X} was written"
-                )
+                return f"{name}: register {register[1]:02X} holds {found:04X}, {wanted:04X} was written"
+        return ""
 
     def self_test(self) -> tuple[str, ...]:
-        """Run the self-test in configuration mode and return what failed."""
-        self.write(epson.MSC_CTRL, high=epson.SELF_TEST >> 8)
+        """Run the self-test in configuration mode and return what failed.
+
+        Raises
+        ------
+        DeviceFaultError
+            If it does not begin: the results that could be read would be old ones.
+        """
+        for _ in range(ATTEMPTS):
+            self.write(epson.MSC_CTRL, high=epson.SELF_TEST >> 8)
+            if self.read(epson.MSC_CTRL) & epson.SELF_TEST:  # it lasts longer than an answer takes
+                break
+        else:
+            raise DeviceFaultError(f"{self._link.name} does not begin its self-test")
         self.await_clear(epson.MSC_CTRL, epson.SELF_TEST, "its self-test")
         found = self.read(epson.DIAG_STAT)
         return tuple(name for bit, name in epson.SELF_TEST_ERRORS.items() if found & bit)
 
     def _select(self, window: int) -> None:
+        """Choose a window; twice, as nothing answers, and in another one the same addresses are other registers."""
         if window != self._window:
-            self._link.write(epson.select_window(window))
+            for _ in range(2):
+                self._link.write(epson.select_window(window))
+                self._clock.sleep_until(self._clock.now() + WRITE_TIME)
             self._window = window
-            self._clock.sleep_until(self._clock.now() + WRITE_TIME)
 
     def _hear(self, size: int) -> bytes:
         """Return up to `size` bytes, or more if they come at once."""

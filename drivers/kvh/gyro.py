@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from drivers.api import ByteLink, Clock, DeviceIdentity, GyroStatus, RateBlock, SelfTest
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, ProtocolError
 from drivers.frame_stream import FrameStream
-from drivers.kvh.settings import Found, configure
+from drivers.kvh.settings import Found, configure, leave
 from drivers.protocol.crc_frames import CrcFrameCounts, Frames
 from drivers.protocol.kvh import (
     ACCELEROMETERS_VALID,
@@ -24,6 +24,7 @@ from drivers.sample_reader import SampleFormat, SampleReader, Samples, Vector
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 _LOOK_TIME = 3.0  # s in which some axis has to become valid
+_LEAVE_TIME = 1.0  # s without a message, after which the unit is told once more to leave configuration mode
 _LOOK_MESSAGES = 10  # in which every axis that there is must be valid once
 _TEST_TIME = 1.0  # s
 
@@ -163,6 +164,7 @@ class KvhGyro:
     def _look(self) -> tuple[list[int], int]:
         """Return which gyros have been valid in some messages, and how many of these had valid accelerometers."""
         deadline = self._clock.now() + max(_LOOK_TIME, 3 * _LOOK_MESSAGES / self.sample_rate)
+        leave_at = self._clock.now() + max(_LEAVE_TIME, 2 / self.sample_rate)
         statuses: list[int] = []
         while self._clock.now() < deadline:
             for frames in self._stream.take():
@@ -170,7 +172,10 @@ class KvhGyro:
             gyros = {axis for status in statuses for axis in range(3) if status & GYROS_VALID[axis]}
             if gyros and len(statuses) >= _LOOK_MESSAGES:
                 return sorted(gyros), sum(status & ACCELEROMETERS_VALID == ACCELEROMETERS_VALID for status in statuses)
-            self._clock.wait(deadline)
+            if not statuses and self._clock.now() >= leave_at:
+                leave(self._stream)
+                leave_at = deadline
+            self._clock.wait(min(leave_at, deadline))
         if statuses:
             raise DeviceFaultError(f"{self._stream.link.name} says of none of its gyros that it is valid")
         raise DeviceTimeoutError(f"{self._stream.link.name} has sent no message after it was asked what it is set to")

@@ -58,7 +58,7 @@ class ConfigurationMode:
             raise DeviceFaultError(f"{self._stream.link.name} refuses ={keyword},{value}")
 
     def _leave(self) -> None:
-        self._stream.link.write(b"=CONFIG,0\r\n")  # which it does not answer
+        leave(self._stream)
 
     def _exchange(self, command: str, keyword: str) -> tuple[bytes, str | None]:
         """Return all that came after a command, and its answer: empty if it is INVALID, None if there is none."""
@@ -70,6 +70,11 @@ class ConfigurationMode:
             if found is not None:
                 return heard, "" if found[1] else found[2].decode("ascii")
         return heard, None
+
+
+def leave(stream: FrameStream) -> None:
+    """Leave configuration mode, which a unit does not answer."""
+    stream.link.write(b"=CONFIG,0\r\n")
 
 
 def configure(stream: FrameStream, *, data_rate: int | None, may_set: bool) -> Found:

@@ -1,0 +1,142 @@
+"""Whatever single message is lost, either way, on whichever line: the measurement goes on to its end, and is right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from served import near_home
+from virtual import Unwatched, assume
+
+from drivers.api import ByteLink, Clock, Gyro, Stage
+from drivers.epson import EpsonGyro
+from drivers.errors import DeviceError
+from drivers.kvh import KvhGyro
+from drivers.native import NativeGyro, NativeStage
+from drivers.stim300 import Stim300Gyro
+from drivers.transport.virtual import VirtualClock, VirtualLink
+from drivers.zaber import ZaberStage, stage_axes
+from northfinder.cyclogram import read_cyclogram
+from northfinder.errors import NorthFinderError
+from northfinder.measurement import Measurement, Outcome, measure
+from sim_device import instruments
+from sim_device.bench import Line, SimBench
+from sim_device.plant.noise import Rates
+from sim_device.plant.profile import load_profile
+
+QUICK_TURN = read_cyclogram(Path(__file__).parent / "quick_turn.toml")
+GYROS: dict[str, Callable[[ByteLink, Clock], Gyro]] = {
+    "native": NativeGyro,
+    "epson": EpsonGyro,
+    "kvh": KvhGyro,
+    "stim300": Stim300Gyro,
+}
+STAGES: dict[str, Callable[[ByteLink, Clock], Stage]] = {
+    "native": NativeStage,
+    "zaber": lambda link, clock: ZaberStage(link, clock, stage_axes()),
+}
+
+
+DIRECTIONS = ("to the gyro", "from the gyro", "to the stage", "from the stage")
+LATEST_S = 4.0  # by which a lost message may hold up a measurement: what takes longest is to find that a stream is over
+EARLY = 60  # messages of connecting, of which each is another; later ones are much alike
+
+
+@dataclass
+class LossyLine:
+    """A line on which one message is lost, counted from 0 for each direction; -1 for none."""
+
+    line: Line
+    lost_to: int = -1
+    lost_from: int = -1
+    n_to: int = 0
+    n_from: int = 0
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Pass what the host says."""
+        self.line.feed(b"" if self.n_to == self.lost_to else data, now_us)
+        self.n_to += 1
+
+    def poll(self, now_us: int) -> bytes:
+        """Pass what the device says."""
+        data = self.line.poll(now_us)
+        self.n_from += bool(data)
+        return b"" if self.n_from - 1 == self.lost_from else data
+
+    def next_due_us(self) -> int | None:
+        """Return when the device is due."""
+        return self.line.next_due_us()
+
+
+class Silence:
+    """A gyro without noise: its measurement is right to what a message lost may change."""
+
+    def read(self, n: int) -> Rates:
+        """Return the next `n` samples, rad/s."""
+        return np.zeros(n)
+
+
+class Bench:
+    """A gyro and a quick stage near its references; of what is said, one message is lost."""
+
+    def __init__(self, gyro: str, stage: str, direction: str = "", message: int = -1) -> None:
+        own = load_profile(instruments.GYROS[gyro].profile)
+        sim = SimBench(
+            replace(own, stage=near_home(brisk=True).stage),
+            gyro=gyro,
+            stage=stage,
+            azimuth=math.radians(33.0),
+            latitude=math.radians(50.429),
+            noise=[Silence()] * own.gyro.n_axes,
+        )
+        lost = [message if each == direction else -1 for each in DIRECTIONS]
+        self.clock = VirtualClock()
+        self.lines = LossyLine(sim.gyro, *lost[:2]), LossyLine(sim.stage, *lost[2:])
+        self._links = [VirtualLink(line, self.clock, name=line.line.name) for line in self.lines]
+        self._kinds = gyro, stage
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many messages were said in each of the directions."""
+        return tuple(n for line in self.lines for n in (line.n_to, line.n_from))
+
+    def measure(self, record: Path) -> Outcome:
+        """Measure four positions of two seconds."""
+        measurement = Measurement(
+            open_gyro=lambda: GYROS[self._kinds[0]](self._links[0], self.clock),
+            open_stage=lambda: STAGES[self._kinds[1]](self._links[1], self.clock),
+            plan=QUICK_TURN,
+            settle=0.5,
+            assumptions=assume(latitude_deg=50.429),
+            record=record,
+        )
+        return measure(measurement, clock=self.clock, utc=self.clock.now, watcher=Unwatched())
+
+
+@pytest.mark.parametrize("n_trials", [6, pytest.param(200, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    ("gyro", "stage"),
+    [("native", "native"), ("native", "zaber"), ("epson", "native"), ("kvh", "native"), ("stim300", "native")],
+)
+def test_a_lost_message_ends_no_measurement(tmp_path: Path, gyro: str, stage: str, n_trials: int) -> None:
+    """Any one, drawn at random: the azimuth is as without the loss, and comes a few seconds later at most."""
+    whole = Bench(gyro, stage)
+    azimuth = whole.measure(tmp_path / "whole.sqlite").fix.azimuth
+    assert azimuth == pytest.approx(math.radians(33.0), abs=math.radians(0.2))
+    rng = np.random.default_rng(1)
+    for trial in range(n_trials):
+        which = int(rng.integers(4))
+        n_messages = whole.counts[which]
+        message = int(rng.integers(min(EARLY, n_messages) if trial % 2 else n_messages))
+        bench = Bench(gyro, stage, DIRECTIONS[which], message)
+        try:
+            outcome = bench.measure(tmp_path / f"{trial}.sqlite")
+        except (DeviceError, NorthFinderError) as error:
+            pytest.fail(f"message {message} {DIRECTIONS[which]} was lost: {error}")
+        assert outcome.fix.azimuth == pytest.approx(azimuth, abs=math.radians(0.1)), (DIRECTIONS[which], message)
+        assert bench.clock.now() < whole.clock.now() + LATEST_S, (DIRECTIONS[which], message)
