@@ -1,14 +1,16 @@
-"""Whatever single message is lost, either way, on whichever line: the measurement goes on to its end, and is right."""
+"""Whatever single message is lost, either way, on any line or bus: the measurement goes on to its end, and is right."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from can_virtual import CanVirtualBench
 from msgspec.structs import replace
 from served import near_home
 from virtual import Unwatched, assume
@@ -26,6 +28,7 @@ from northfinder.errors import NorthFinderError
 from northfinder.measurement import Measurement, Outcome, measure
 from sim_device import instruments
 from sim_device.bench import Line, SimBench
+from sim_device.can_bench import CanBench
 from sim_device.plant.noise import Rates
 from sim_device.plant.profile import load_profile
 
@@ -42,7 +45,8 @@ STAGES: dict[str, Callable[[ByteLink, Clock], Stage]] = {
 }
 
 
-DIRECTIONS = ("to the gyro", "from the gyro", "to the stage", "from the stage")
+LOST_TO = ("to the gyro", "to the stage")
+LOST_FROM = ("from the gyro", "from the stage")
 LATEST_S = 4.0  # by which a lost message may hold up a measurement: what takes longest is to find that a stream is over
 EARLY = 60  # messages of connecting, of which each is another; later ones are much alike
 
@@ -81,7 +85,7 @@ class Silence:
         return np.zeros(n)
 
 
-class Bench:
+class SerialBench:
     """A gyro and a quick stage near its references; of what is said, one message is lost."""
 
     def __init__(self, gyro: str, stage: str, direction: str = "", message: int = -1) -> None:
@@ -94,16 +98,19 @@ class Bench:
             latitude=math.radians(50.429),
             noise=[Silence()] * own.gyro.n_axes,
         )
-        lost = [message if each == direction else -1 for each in DIRECTIONS]
         self.clock = VirtualClock()
-        self.lines = LossyLine(sim.gyro, *lost[:2]), LossyLine(sim.stage, *lost[2:])
-        self._links = [VirtualLink(line, self.clock, name=line.line.name) for line in self.lines]
         self._kinds = gyro, stage
+        self._lines = [
+            LossyLine(line, message if direction == to else -1, message if direction == back else -1)
+            for line, to, back in zip((sim.gyro, sim.stage), LOST_TO, LOST_FROM, strict=True)
+        ]
+        self._links = [VirtualLink(line, self.clock, name=line.line.name) for line in self._lines]
 
     @property
-    def counts(self) -> tuple[int, ...]:
-        """How many messages were said in each of the directions."""
-        return tuple(n for line in self.lines for n in (line.n_to, line.n_from))
+    def counts(self) -> dict[str, int]:
+        """How many messages were said in each direction."""
+        said = {to: line.n_to for to, line in zip(LOST_TO, self._lines, strict=True)}
+        return said | {back: line.n_from for back, line in zip(LOST_FROM, self._lines, strict=True)}
 
     def measure(self, record: Path) -> Outcome:
         """Measure four positions of two seconds."""
@@ -118,25 +125,57 @@ class Bench:
         return measure(measurement, clock=self.clock, utc=self.clock.now, watcher=Unwatched())
 
 
-@pytest.mark.parametrize("n_trials", [6, pytest.param(200, marks=pytest.mark.campaign)])
-@pytest.mark.parametrize(
-    ("gyro", "stage"),
-    [("native", "native"), ("native", "zaber"), ("epson", "native"), ("kvh", "native"), ("stim300", "native")],
-)
-def test_a_lost_message_ends_no_measurement(tmp_path: Path, gyro: str, stage: str, n_trials: int) -> None:
+class BusBench:
+    """The same on a CAN bus, where one frame is lost."""
+
+    def __init__(self, direction: str = "", message: int = -1) -> None:
+        world = CanBench(
+            near_home(brisk=True), azimuth=math.radians(33.0), latitude=math.radians(50.429), noise=[Silence()]
+        )
+        self._bench = CanVirtualBench(world)
+        self._bench.tap.to_bench = partial(self._fate, "to the bench")
+        self._bench.tap.to_host = partial(self._fate, "from the bench")
+        self._lost = direction, message
+        self.clock = self._bench.clock
+        self.counts = {"to the bench": 0, "from the bench": 0}
+
+    def measure(self, record: Path) -> Outcome:
+        """Measure four positions of two seconds."""
+        return self._bench.measure(record, QUICK_TURN, latitude_deg=50.429)
+
+    def _fate(self, direction: str, identifier: int, data: bytes) -> list[tuple[int, bytes]]:
+        lost = self._lost == (direction, self.counts[direction])
+        self.counts[direction] += 1
+        return [] if lost else [(identifier, data)]
+
+
+BENCHES: dict[str, Callable[..., SerialBench | BusBench]] = {
+    "native": partial(SerialBench, "native", "native"),
+    "zaber": partial(SerialBench, "native", "zaber"),
+    "epson": partial(SerialBench, "epson", "native"),
+    "kvh": partial(SerialBench, "kvh", "native"),
+    "stim300": partial(SerialBench, "stim300", "native"),
+    "CAN": BusBench,
+}
+
+
+@pytest.mark.parametrize("n_trials", [4, pytest.param(200, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("make", BENCHES.values(), ids=list(BENCHES))
+def test_a_lost_message_ends_no_measurement(
+    tmp_path: Path, make: Callable[..., SerialBench | BusBench], n_trials: int
+) -> None:
     """Any one, drawn at random: the azimuth is as without the loss, and comes a few seconds later at most."""
-    whole = Bench(gyro, stage)
+    whole = make()
     azimuth = whole.measure(tmp_path / "whole.sqlite").fix.azimuth
     assert azimuth == pytest.approx(math.radians(33.0), abs=math.radians(0.2))
     rng = np.random.default_rng(1)
     for trial in range(n_trials):
-        which = int(rng.integers(4))
-        n_messages = whole.counts[which]
+        direction, n_messages = list(whole.counts.items())[int(rng.integers(len(whole.counts)))]
         message = int(rng.integers(min(EARLY, n_messages) if trial % 2 else n_messages))
-        bench = Bench(gyro, stage, DIRECTIONS[which], message)
+        bench = make(direction, message)
         try:
             outcome = bench.measure(tmp_path / f"{trial}.sqlite")
         except (DeviceError, NorthFinderError) as error:
-            pytest.fail(f"message {message} {DIRECTIONS[which]} was lost: {error}")
-        assert outcome.fix.azimuth == pytest.approx(azimuth, abs=math.radians(0.1)), (DIRECTIONS[which], message)
-        assert bench.clock.now() < whole.clock.now() + LATEST_S, (DIRECTIONS[which], message)
+            pytest.fail(f"message {message} {direction} was lost: {error}")
+        assert outcome.fix.azimuth == pytest.approx(azimuth, abs=math.radians(0.1)), (direction, message)
+        assert bench.clock.now() < whole.clock.now() + LATEST_S, (direction, message)
