@@ -17,6 +17,8 @@ from drivers.sample_reader import SampleFormat, SampleReader, Samples, Vector
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 COUNTER_SPAN = 65_536
+START_ATTEMPTS = 3
+START_TIME = 0.2  # s, and two samples, in which the first must come
 _SATURATION = 2**31 - 2**20  # steps of a 32-bit field: next to its end
 
 
@@ -105,7 +107,7 @@ class EpsonGyro:
 
     def start(self) -> None:
         """Enter sampling mode; samples are counted from the first that comes."""
-        unit, reader = self._connected()
+        unit, stream, reader = self._connected()
         if reader.under_way:
             return
         self._registers.enter_configuration()
@@ -118,8 +120,7 @@ class EpsonGyro:
             rate_lsb=unit.model.rate_lsb,
             span=COUNTER_SPAN,
         )
-        reader.begin(form)
-        self._registers.start_sampling()
+        reader.begin(form, waiting=self._first_frames(stream))
 
     def read(self) -> list[RateBlock]:
         """Return the blocks that have arrived, oldest first, ``[]`` if none. Never waits.
@@ -131,11 +132,11 @@ class EpsonGyro:
         DeviceTimeoutError
             If the stream has fallen silent.
         """
-        return self._connected()[1].read()
+        return self._connected()[-1].read()
 
     def stop(self) -> None:
         """Leave sampling mode. What was sent before can still be read."""
-        _, reader = self._connected()
+        reader = self._connected()[-1]
         if reader.under_way:
             self._registers.stop_sampling()
         reader.end()
@@ -151,11 +152,22 @@ class EpsonGyro:
             self._reader = None
             self._link.close()
 
-    def _connected(self) -> tuple[Unit, SampleReader]:
-        if self._unit is None or self._reader is None:
+    def _connected(self) -> tuple[Unit, FrameStream, SampleReader]:
+        if self._unit is None or self._stream is None or self._reader is None:
             self._link.receive()  # a lost link is told as such
             raise ProtocolError(f"{self._link.name} has not been connected")
-        return self._unit, self._reader
+        return self._unit, self._stream, self._reader
+
+    def _first_frames(self, stream: FrameStream) -> list[Frames]:
+        """Enter sampling mode, which nothing answers: again if nothing comes; return the first that did."""
+        for _ in range(START_ATTEMPTS):
+            self._registers.start_sampling()
+            deadline = self._clock.now() + START_TIME + 2 / self._sample_rate
+            while self._clock.now() < deadline:
+                if frames := stream.take():
+                    return frames
+                self._clock.wait(deadline)
+        return []
 
     def _decode(self, frames: list[Frames]) -> tuple[Samples | None, DeviceError | None]:
         """Return the samples in bursts."""

@@ -27,6 +27,7 @@ _LOOK_TIME = 3.0  # s in which some axis has to become valid
 _LEAVE_TIME = 1.0  # s without a message, after which the unit is told once more to leave configuration mode
 _LOOK_MESSAGES = 10  # in which every axis that there is must be valid once
 _TEST_TIME = 1.0  # s
+_TEST_ATTEMPTS = 2
 
 
 class KvhGyro:
@@ -112,10 +113,11 @@ class KvhGyro:
 
     def self_test(self) -> SelfTest:
         """Ask for the built-in test; of a unit that has none, look at what its messages say of themselves."""
-        self._stream.link.write(b"?BIT\r\n")
-        _, failures = self._stream.hear(find_test, patience=_TEST_TIME)
-        if failures is not None:
-            return SelfTest(failures)
+        for _ in range(_TEST_ATTEMPTS):
+            self._stream.link.write(b"?BIT\r\n")
+            _, failures = self._stream.hear(find_test, patience=_TEST_TIME)
+            if failures is not None:
+                return SelfTest(failures)
         valid, _ = self._look()
         return SelfTest(tuple(f"gyro {'xyz'[axis]} is not valid" for axis in self._axes if axis not in valid))
 
