@@ -17,10 +17,12 @@ import pytest
 from interruptible import BENCHES, INTERRUPTIONS, LiveBench, interruptible
 
 from drivers.transport.clock import SystemClock
+from northfinder.cli import interruption
 from northfinder.cli.bench import stop_on_signal
 from northfinder.errors import RecordError
 from northfinder.record import Record
 from northfinder.record.check import examine
+from northfinder.sequencer import StopRequestedError
 
 NORTHFINDER = [sys.executable, "-m", "northfinder"]
 FIND = [*NORTHFINDER, *["find", "--speed", "max", "--seed", "1", "--plan", "four-position", "--dwell", "20"]]
@@ -121,6 +123,32 @@ def test_interrupted_while_the_stage_moves(tmp_path: Path, how: str, devices: st
         assert not bench.stage_moves()
     assert last_state(only_record(tmp_path / "records")) == "stopped"
     assert examine(only_record(tmp_path / "records")).sound
+
+
+@pytest.mark.parametrize("n_moments", [6, pytest.param(300, marks=pytest.mark.campaign)])
+def test_interrupted_while_it_starts(tmp_path: Path, n_moments: int) -> None:
+    """At any moment of its first second, in which modules are imported: it ends, and has not been heard in vain."""
+    rng = np.random.default_rng(12)
+    command = [*NORTHFINDER, "find", "--speed", "1", "--quiet"]
+    for number in range(n_moments):
+        with interruptible("SIGTERM", command, tmp_path / str(number)) as host:
+            host.go_on(rng.uniform(0.05, 1.2))
+            host.interrupt()
+            assert host.wait(5) in {130, -signal.SIGTERM}
+
+
+def test_an_interruption_that_was_swallowed_stops_a_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is raised in a callback of Python's own is lost; that a signal has come is not."""
+    monkeypatch.setattr(interruption, "has_come", True)
+    with pytest.raises(StopRequestedError):
+        measure_nothing()
+
+
+def measure_nothing() -> None:
+    """Measure as the program does, but for the measurement."""
+    with stop_on_signal(SystemClock()) as stop_requested:
+        if stop_requested():
+            raise StopRequestedError
 
 
 def test_a_result_that_nobody_takes(tmp_path: Path) -> None:

@@ -74,6 +74,7 @@ class _LazyGroup(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module = importlib.import_module(f"northfinder.cli.{_MODULES.get(cmd_name, cmd_name)}")
+        interruption.begun = True
         command: click.Command = module.command
         for parameter in command.params:
             if isinstance(parameter.type, click.types.FloatParamType):
@@ -106,25 +107,46 @@ class _Interrupted(BaseException):
     """A signal to end. No KeyboardInterrupt: click would say so first, to streams that perhaps nobody reads."""
 
 
+class _Interruption:
+    """What the handler of signals knows and leaves; no `threading.Event`, whose lock a second signal would wait for."""
+
+    #: Whether a command has been imported. Before, nothing is open, and what is raised may be swallowed: Python calls
+    #: back while it imports, and ignores what comes of that.
+    begun = False
+    #: Whether a signal to end has come since, in case what it raised was swallowed all the same.
+    has_come = False
+
+
+interruption = _Interruption()
+
+
 def program() -> NoReturn:
     """Run the process's own command line, until it is done or a signal tells it to end."""
+    signals = ending_signals()
 
     def interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  # the signal module's signature
+        if not interruption.begun:
+            _leave_interrupted(signals)
+        interruption.has_come = True
         raise _Interrupted
 
-    signals = ending_signals()
     for number in signals:
         signal.signal(number, interrupt)
     try:
         main()
-    except _Interrupted:  # all is in order again; what else was still to be said may have nobody to read it
-        _ignore(signals)
-        with suppress(OSError, ValueError):
-            if select.select([], [sys.stderr], [], 0.0)[1]:
-                os.write(sys.stderr.fileno(), b"northfinder: interrupted\n")
-        os._exit(EXIT_INTERRUPTED)
+    except _Interrupted:  # all is in order again
+        _leave_interrupted(signals)
     finally:
         _ignore(signals)  # it is too late for another exit code
+
+
+def _leave_interrupted(signals: list[signal.Signals]) -> NoReturn:
+    """Leave at once; what else was still to be said may have nobody to read it."""
+    _ignore(signals)
+    with suppress(OSError, ValueError):
+        if select.select([], [sys.stderr], [], 0.0)[1]:
+            os.write(sys.stderr.fileno(), b"northfinder: interrupted\n")
+    os._exit(EXIT_INTERRUPTED)
 
 
 def _ignore(signals: list[signal.Signals]) -> None:

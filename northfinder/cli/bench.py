@@ -12,7 +12,7 @@ from typing import TypeVar
 from drivers.api import Clock, Gyro, Stage
 from drivers.discovery import check_gyro, check_stage, open_gyro, open_stage
 from drivers.transport.clock import SystemClock
-from northfinder.cli import ending_signals
+from northfinder.cli import ending_signals, interruption
 from northfinder.config import Config, GyroTable, StageTable, read_config
 from northfinder.errors import ConfigError
 
@@ -72,7 +72,7 @@ def stop_on_signal(clock: SystemClock) -> Iterator[Callable[[], bool]]:
 
     One that came when there was nothing left to stop interrupts what follows: nobody may be there to read it.
     """
-    requested = False
+    requested = interruption.has_come
 
     def request(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  # the signal module's signature
         nonlocal requested
