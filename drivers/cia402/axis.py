@@ -145,8 +145,11 @@ class Axis:
             if word & Status.ACKNOWLEDGED:
                 self.activity = Activity.TAKEN
                 self.control(Control.ENABLE)
-        elif self.activity is Activity.TAKEN and not word & Status.ACKNOWLEDGED:
-            self.activity = Activity.MOVING
+        elif self.activity is Activity.TAKEN:
+            if word & Status.ACKNOWLEDGED:
+                self.control(Control.ENABLE)  # once more: it may have been lost
+            else:
+                self.activity = Activity.MOVING
         if self.activity is Activity.MOVING and not word & Status.ACKNOWLEDGED and word & Status.TARGET_REACHED:
             self.activity, self.in_position = Activity.REST, True
         self._advance_homing(word)
@@ -163,6 +166,10 @@ class Axis:
         self._target = position
         self.refusal, self.in_position = "", False
         self.activity = Activity.OFFERED
+        self.offer_again()
+
+    def offer_again(self) -> None:
+        """Offer the set-point by a rising edge; it may have been lost before, and is absolute."""
         self.control(Control.ENABLE)
         self.control(Control.START)
 

@@ -20,6 +20,9 @@ from drivers.limits import joined, require_within
 
 IDENTIFIERS = (0x080, 0x180, 0x280, 0x580, 0x700)  #: to which each node's number is added
 REST_TIMEOUT = 10.0  # s for a drive found moving to come to rest
+INSIST_PERIOD = (
+    0.3  # s after which a set-point that a drive has not taken is offered again; in motion it tells its state sooner
+)
 STOP_INTERVAL = 0.05  # s between repetitions of a stop
 STOP_ATTEMPTS = 20
 
@@ -162,7 +165,7 @@ class Cia402Stage:
             axis.set_speed(speed)
         for axis, angle in zip(self._axes, (azimuth, elevation), strict=True):
             axis.offer(round(angle * axis.units))
-        self._await_both(lambda axis: axis.activity is not Activity.OFFERED, "taken the set-point")
+        self._await_both(lambda axis: axis.activity is not Activity.OFFERED, "taken the set-point", Axis.offer_again)
         self._state = self._newest()
 
     def state(self) -> StageState:
@@ -281,8 +284,11 @@ class Cia402Stage:
             if axis.activity is not Activity.REST:
                 raise DeviceFaultError(f"{axis.name} refuses {what}: it must be at rest first")
 
-    def _await_both(self, so: Callable[[Axis], bool], what: str) -> None:
-        """Wait until something is so of both axes; stop both and raise if it does not come to that."""
+    def _await_both(
+        self, so: Callable[[Axis], bool], what: str, insist: Callable[[Axis], None] = lambda _: None
+    ) -> None:
+        """Wait until something is so of both axes; stop both and raise if it does not come to that, insisted or not."""
+        insist_at = self._clock.now() + INSIST_PERIOD
         deadline = self._clock.now() + ANSWER_TIMEOUT
         while True:
             missing = [axis for axis in self._axes if not so(axis)]
@@ -298,6 +304,10 @@ class Cia402Stage:
                     if troubled
                     else DeviceTimeoutError(f"{missing[0].name} has not {what} within {ANSWER_TIMEOUT:g} s")
                 )
+            if self._clock.now() >= insist_at:
+                for axis in missing:
+                    insist(axis)
+                insist_at += INSIST_PERIOD
             self._presence.wait(deadline)
 
 
