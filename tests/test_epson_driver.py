@@ -130,6 +130,40 @@ def test_a_running_sensor_is_taken_over() -> None:
     assert again.read()[0].first_index == 0
 
 
+class Deaf:
+    """The sensor's line, on which one command is lost."""
+
+    def __init__(self, line: FaultyLine, lost: int) -> None:
+        self.poll, self.next_due_us = line.poll, line.next_due_us
+        self._line, self._lost = line, lost
+        self.n_commands = 0
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Pass a command, or lose it."""
+        if self.n_commands != self._lost:
+            self._line.feed(data, now_us)
+        self.n_commands += 1
+
+
+def test_any_one_command_may_be_lost() -> None:
+    """It is set, its self-test has run and has failed, and it streams: each command of all that, lost in turn."""
+
+    def begun_without(lost: int) -> int:
+        bench = Bench()
+        bench.sim.gyro_board.self_test_failures = 4
+        bench.link.close()  # which would take what comes on the line
+        line = Deaf(bench.line, lost)
+        bench.gyro = EpsonGyro(VirtualLink(line, bench.clock), bench.clock)
+        bench.gyro.connect()
+        assert bench.gyro.self_test().failures == ("gyro x", "gyro y", "gyro z", "accelerometers"), lost
+        bench.gyro.start()
+        assert bench.stream(0.5), lost
+        return line.n_commands
+
+    for lost in range(begun_without(-1)):
+        begun_without(lost)
+
+
 def test_a_failed_self_test_has_names() -> None:
     """What the sensor finds wrong with itself is told by name."""
     bench = Bench()
