@@ -104,6 +104,25 @@ def test_error_frames_point_to_the_bit_rate() -> None:
     assert gyro.troubles["errors on the bus"] > 0
 
 
+@pytest.mark.parametrize("nth", [1, 2, 3], ids=["falling edge", "set-point", "end of the handshake"])
+def test_a_lost_controlword_of_a_move_is_made_up_for(nth: int) -> None:
+    """Of the three that an axis is sent for a move, one is lost: it arrives all the same."""
+    bench = can_bench()
+    stage = bench.homed()
+    n_sent = 0
+
+    def lose(identifier: int, data: bytes) -> list[tuple[int, bytes]]:
+        nonlocal n_sent
+        n_sent += identifier == 0x200 + AZIMUTH_ID
+        return [] if identifier == 0x200 + AZIMUTH_ID and n_sent == nth else [(identifier, data)]
+
+    bench.tap.to_bench = lose
+    stage.move(radians(20), 0.0)
+    state = bench.serve(stage, lambda state: state.in_position, timeout=20.0)
+    assert state.azimuth == pytest.approx(radians(20), abs=1e-4)
+    assert n_sent >= 3
+
+
 def test_a_stray_answer_holds_up_no_wait() -> None:
     """An SDO answer that nobody asked for, in the place of a heartbeat, lets the wait for the node end in its time."""
     bench = can_bench()
