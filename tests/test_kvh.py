@@ -324,6 +324,26 @@ class TestDriver:
         assert abs(flagged[0].n_lost - 200) <= 1
         assert flagged[0].device_time > before - 3.0
 
+    @pytest.mark.parametrize("word", [b"=CONFIG,0\r\n", b"?BIT\r\n"])
+    def test_a_lost_word_is_said_again(self, monkeypatch: pytest.MonkeyPatch, word: bytes) -> None:
+        """The first end of configuration mode, or question for the built-in test, is lost: it is found all the same."""
+        board = SlowBoard()
+        board.failures = 1
+        rig = Rig(board)
+        heard, feed = [], rig.device.feed
+
+        def lose_the_first(data: bytes, now_us: int) -> None:
+            heard.append(data)
+            if data != word or heard.count(word) > 1:
+                feed(data, now_us)
+
+        monkeypatch.setattr(rig.device, "feed", lose_the_first)
+        rig.gyro.connect()
+        assert not rig.gyro.self_test().passed
+        rig.gyro.start()
+        assert rig.run(1.0)
+        assert heard.count(word) == 2
+
     def test_silence_and_unplugging(self) -> None:
         """A unit that falls silent is a timeout; a cable that is pulled, a lost link."""
         rig = Rig().started()
